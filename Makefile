@@ -1,0 +1,39 @@
+# Each target works alone on a fresh clone: it needs python3 (3.11 or newer) and make, nothing else.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check install clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
+
+demo: $(INSTALLED)  ## train on built-in circuits and evaluate on held-out ones (at most 5 minutes)
+	$(BIN)/outlap demo
+
+test: $(INSTALLED)  ## run the tests (OUTLAP_TRACKS=FOLDER adds those that need real circuits)
+	$(BIN)/python -m pytest
+
+check: $(INSTALLED)  ## lint, formatting, types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+install: $(INSTALLED)  ## make .venv and install outlap into it
+
+clean:  ## remove .venv and what tools left behind
+	rm -rf $(VENV) dist build .pytest_cache .ruff_cache .hypothesis
+	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Made last, so that an install that was cut off is done again.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo \
+	  "outlap needs Python 3.11 or newer, and $(PYTHON) is older or missing: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo \
+	  "cannot make a virtual environment: on Debian and Ubuntu, apt install python3-venv" >&2; exit 1; }
+	@echo "installing outlap and its dependencies into $(VENV): a few minutes the first time" >&2
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@

@@ -1,0 +1,159 @@
+"""`outlap`: finds the command, runs it, and turns every mistake into one line and an exit code.
+
+Exit codes: 0 done; 1 a bug, with its traceback; 2 wrong arguments or bad input; 130 after Ctrl-C; 141 when
+the reader of the output has gone. Only the module of the command that was asked for is imported.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from outlap.cli.output import (
+    STANDARD_OUTPUT,
+    CommandResult,
+    check_json_path,
+    deliver,
+    standard_output_kept_clean,
+)
+from outlap.errors import OutlapError
+
+DONE, BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED = 0, 2, 130, 141
+
+
+class Command(Protocol):
+    """A dataclass whose fields are the flags; tyro builds it.
+
+    Progress and logs go to standard error. A class with `from_config(path)` also takes `--config FILE`.
+    """
+
+    json: str | None
+
+    def run(self) -> CommandResult: ...
+
+
+class Entry(NamedTuple):
+    words: str  # what the user types after `outlap`
+    target: str  # module:class, imported when it is asked for
+    summary: str
+
+
+COMMANDS = (
+    Entry("tracks list", "outlap.cli.tracks:ListTracks", "the tracks that can be used by name"),
+    Entry("tracks show", "outlap.cli.tracks:ShowTrack", "draw a track: map, centreline, curvature"),
+    Entry("tracks generate", "outlap.cli.tracks:GenerateTrack", "make a random closed circuit from a seed"),
+    Entry("tracks import", "outlap.cli.tracks:ImportTrack", "make an F1TENTH map folder of a centreline csv"),
+    Entry("tracks download", "outlap.cli.tracks:DownloadTracks", "get circuits from the official archive"),
+    Entry("train ppo", "outlap.cli.train:TrainPPO", "train a policy with PPO and domain randomization"),
+    Entry("evaluate", "outlap.cli.evaluate:Evaluate", "race a trained policy on tracks and measure it"),
+    Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),
+    Entry("demo", "outlap.cli.demo:Demo", "train and evaluate on built-in circuits in a few minutes"),
+)
+
+
+def run() -> None:
+    """The console script."""
+    sys.exit(main())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: the words after `outlap`; those of the process if None.
+
+    Returns:
+        The exit code.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    prog = "outlap"
+    try:
+        text = _information(arguments)
+        if text is not None:
+            print(text, flush=True)
+            return DONE
+        entry = _find(arguments)
+        prog = f"outlap {entry.words}"
+        return _execute(entry, arguments[len(entry.words.split()) :], prog)
+    except OutlapError as error:
+        print(f"{prog}: error: {' '.join(str(error).splitlines())}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:
+    from outlap.cli.arguments import parse
+
+    module, _, name = entry.target.partition(":")
+    command_class: type[Command] = getattr(importlib.import_module(module), name)
+    try:
+        command = parse(command_class, arguments, prog)
+    except SystemExit:  # after --help
+        return DONE
+    check_json_path(command.json)
+    only_json = command.json == STANDARD_OUTPUT
+    with standard_output_kept_clean() if only_json else contextlib.nullcontext():
+        result = command.run()
+    try:
+        deliver(result, command.json)
+    except BrokenPipeError:
+        # `| head` has seen enough; nor may the interpreter complain when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OUTPUT_CLOSED
+    return DONE
+
+
+def _information(arguments: Sequence[str]) -> str | None:
+    """The text for `--version` and for `--help` of outlap or of a group; None where a command is meant."""
+    if list(arguments) == ["--version"]:
+        from importlib.metadata import version
+
+        return f"outlap {version('outlap')}"
+    if not arguments or arguments[-1] not in ("-h", "--help"):
+        return None
+    group = list(arguments[:-1])
+    entries = [entry for entry in COMMANDS if entry.words.split()[: len(group)] == group]
+    if not entries or any(entry.words.split() == group for entry in entries):
+        return None
+    width = max(len(entry.words) for entry in COMMANDS)
+    return "\n".join(
+        [
+            f"usage: {' '.join(['outlap', *group])} COMMAND [--flags]",
+            "",
+            "F1TENTH racing policies that adapt within an out-lap.",
+            "",
+            *(f"  {entry.words:{width}}  {entry.summary}" for entry in entries),
+            "",
+            "`outlap COMMAND --help` lists the flags of one command. Every command takes `--json PATH`;",
+            "`-` is standard output. Exit codes: 0 done, 2 wrong arguments or input, 130 after Ctrl-C.",
+        ]
+    )
+
+
+def _find(arguments: Sequence[str]) -> Entry:
+    group: list[str] = []
+    while True:
+        entries = [entry for entry in COMMANDS if entry.words.split()[: len(group)] == group]
+        if len(entries) == 1 and entries[0].words.split() == group:
+            return entries[0]
+        choices = list(dict.fromkeys(entry.words.split()[len(group)] for entry in entries))
+        word = arguments[len(group)] if len(group) < len(arguments) else None
+        if word in choices:
+            group.append(word)
+            continue
+        close = difflib.get_close_matches(word or "", choices, 1)
+        hint = f"choose from {', '.join(choices)}"
+        if close:
+            hint = f"did you mean {' '.join([*group, *close])!r}?"
+        if word is None:
+            fault = f"{group[-1]} needs a command" if group else "no command"
+        else:
+            fault = f"{' '.join([*group, word])!r} is not a command"
+        raise OutlapError(f"{fault}; {hint}")

@@ -1,0 +1,121 @@
+"""What a command hands back, and how it reaches the screen and the JSON file."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from outlap.errors import OutlapError
+from outlap.files import atomic_write
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+STANDARD_OUTPUT = "-"
+
+
+@dataclasses.dataclass(frozen=True)
+class CommandResult:
+    """What a command found: the same content for a program and for a person.
+
+    Args:
+        data: what `--json` writes; keys in snake_case with the unit at the end.
+        show: prints it for a person, as a table for example, on the console it is given.
+    """
+
+    data: Mapping[str, Any]
+    show: Callable[[Console], None]
+
+
+def check_json_path(path: str | None) -> None:
+    """Make the folder of `path` now, so that an hour of work does not end in a failed write.
+
+    Raises:
+        OutlapError: `path` is a folder, or nothing can be written there.
+    """
+    if path is None or path == STANDARD_OUTPUT:
+        return
+    if not path or Path(path).is_dir():
+        raise OutlapError(f"--json is {path!r}, a folder; must be a file, or - for standard output")
+    folder = Path(path).absolute().parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutlapError(f"--json {path}: cannot make the folder {folder}: {error.strerror}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutlapError(f"--json {path}: the folder {folder} cannot be written to")
+
+
+def deliver(result: CommandResult, json_path: str | None) -> None:
+    """Show `result` on standard output, or as JSON there if `json_path` is `-`, or both where it is a file.
+
+    Raises:
+        BrokenPipeError: nobody reads standard output any more.
+    """
+    if json_path == STANDARD_OUTPUT:
+        print(to_json(result.data), flush=True)
+        return
+    if json_path is not None:
+        atomic_write(json_path, to_json(result.data) + "\n")
+    result.show(_result_console())
+    sys.stdout.flush()
+
+
+def to_json(data: Any) -> str:
+    """`data` as indented JSON: NaN and infinity as null, arrays as lists, paths as strings."""
+    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+@contextlib.contextmanager
+def standard_output_kept_clean() -> Iterator[None]:
+    """Send whatever is printed meanwhile, by libraries and child processes too, to standard error."""
+    sys.stdout.flush()
+    saved = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        sys.stderr.flush()
+        os.dup2(saved, 1)
+        os.close(saved)
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case None | bool() | str():
+            return value
+        case float():  # np.float64 is one too
+            return float(value) if math.isfinite(value) else None
+        case int():
+            return int(value)
+        case os.PathLike():
+            return os.fspath(value)
+        case Mapping():
+            return {str(_plain(key)): _plain(each) for key, each in value.items()}
+        case list() | tuple() | set() | frozenset():
+            return [_plain(each) for each in value]
+    if hasattr(value, "model_dump"):  # a Config
+        return _plain(value.model_dump(mode="json"))
+    if hasattr(value, "tolist"):  # NumPy scalars and arrays, without importing NumPy for those who have none
+        return _plain(value.tolist())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    raise TypeError(f"a {type(value).__name__} has no form in JSON")
+
+
+def _result_console() -> Console:
+    from rich.console import Console
+
+    class ResultConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise  # rich calls this while it handles the error, and would exit with 1; main decides
+
+    return ResultConsole()

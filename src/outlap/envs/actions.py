@@ -1,0 +1,29 @@
+"""Actions: (steer, speed) in [-1, 1], and the commands that they mean."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from outlap.simulator.vehicle import STEER_MAX, STEER_MIN, V_MAX, V_MIN
+
+
+def commands(actions: np.ndarray, params: np.ndarray, speed_range: tuple[float, float] | None) -> np.ndarray:
+    """Steering angles [rad] and speeds [m/s] of normalised actions.
+
+    ±1 in the first column is the left / right stop, 0 is straight ahead; -1 … 1 in the second spans the speed
+    range.
+
+    Args:
+        actions: (..., 2) in [-1, 1]: steer (left positive), speed.
+        params: (..., N_PARAMS) of the cars.
+        speed_range: speeds that -1 and 1 stand for [m/s]; None takes each car's own v_min and v_max.
+
+    Returns:
+        float32 (..., 2).
+    """
+    steer, speed = actions[..., 0], actions[..., 1]
+    out = np.empty(actions.shape, np.float32)
+    out[..., 0] = np.where(steer >= 0.0, steer * params[..., STEER_MAX], -steer * params[..., STEER_MIN])
+    low, high = speed_range if speed_range else (params[..., V_MIN], params[..., V_MAX])
+    out[..., 1] = low + 0.5 * (speed + 1.0) * (high - low)
+    return out

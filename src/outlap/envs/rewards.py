@@ -1,0 +1,169 @@
+"""Reward terms, a function a term, and the presets that weigh them.
+
+A term is unweighted: (worlds,) float. The reward is the sum of weight × term. Constants: `RewardConfig`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from outlap.config import Config
+from outlap.envs.race import EGO, Race
+from outlap.simulator.atlas import Atlas
+from outlap.simulator.vehicle import A_MAX, V_MAX
+from outlap.track.centerline import CURVATURE
+from outlap.track.track import Track
+
+LATERAL_SHARE = 0.8  # of mu g that the reference speed of a track without a raceline uses
+GRAVITY = 9.81  # [m/s^2]
+
+
+class RewardConfig(Config):
+    """Which terms count, how much, and their constants.
+
+    The curricula count environment steps of all worlds together since training began.
+    """
+
+    preset: Literal["fast", "paper"] = "fast"  # where weights come from
+    weights: dict[str, float] = {}  # by term, in place of the preset's
+    milestones: int = Field(default=10, ge=1)  # per lap
+    collision_max: float = Field(default=10.0, ge=1)  # to which the collision penalty grows; 1 = never grows
+    collision_steps: float = Field(default=1e5, gt=0)  # over which it grows
+    velocity_step: float = 1e6  # at which the weight of velocity matching has halved
+    velocity_width: float = Field(default=1e5, gt=0)  # [steps] of that fall
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_preset_name(cls, value: Any) -> Any:
+        return {"preset": value} if isinstance(value, str) else value
+
+    @field_validator("weights")
+    @classmethod
+    def _known_terms(cls, weights: dict[str, float]) -> dict[str, float]:
+        for name in weights:
+            if name not in REWARD_TERMS:
+                raise ValueError(f"{name!r} is not a reward term; there are {', '.join(REWARD_TERMS)}")
+        return weights
+
+    def resolved(self) -> dict[str, float]:
+        """The weight of every term that counts."""
+        weights = {**REWARD_PRESETS[self.preset], **self.weights}
+        return {name: weight for name, weight in weights.items() if weight != 0.0}
+
+
+def milestone(race: Race, config: RewardConfig) -> np.ndarray:
+    """Milestones passed for the first time: one at each 1 / milestones of a lap from the start."""
+    step = race.length / config.milestones
+    passed = np.floor((race.farthest - race.start) / step)
+    return passed - np.floor((race.farthest_before - race.start) / step)
+
+
+def progress(race: Race, config: RewardConfig) -> np.ndarray:
+    """Advance along the centreline [m]."""
+    return race.distance - race.distance_before
+
+
+def lap_progress(race: Race, config: RewardConfig) -> np.ndarray:
+    """Advance along the centreline [laps]."""
+    return progress(race, config) / race.length
+
+
+def collision(race: Race, config: RewardConfig) -> np.ndarray:
+    """-(1 + (c_max - 1) tanh(t / T)) where the ego crashed: a penalty that grows over training."""
+    growth = np.tanh(race.training_steps / config.collision_steps)
+    return np.where(race.crashed, -(1.0 + (config.collision_max - 1.0) * growth), 0.0)
+
+
+def velocity_matching(race: Race, config: RewardConfig) -> np.ndarray:
+    """-(v - v_ref)^2 w(t) [m^2/s^2]: w falls over training from 1 to 0 as a sigmoid."""
+    rows = race.line_rows(EGO, np.zeros(1))[:, 0]
+    reference = np.minimum(race.reference_speed[rows], race.worlds.params[:, EGO, V_MAX])
+    x = (race.training_steps - config.velocity_step) / config.velocity_width
+    weight = 0.5 * (1.0 - np.tanh(0.5 * x))
+    return -weight * (race.speed - reference) ** 2
+
+
+def steering_change(race: Race, config: RewardConfig) -> np.ndarray:
+    """-|change of the steering action|."""
+    return -np.abs(race.actions[:, EGO, 0] - race.actions_before[:, EGO, 0])
+
+
+def speed_change(race: Race, config: RewardConfig) -> np.ndarray:
+    """-|change of the speed action|."""
+    return -np.abs(race.actions[:, EGO, 1] - race.actions_before[:, EGO, 1])
+
+
+def overtake(race: Race, config: RewardConfig) -> np.ndarray:
+    """Places gained less places lost."""
+    return (race.places_gained - race.places_lost).astype(np.float64)
+
+
+REWARD_TERMS: dict[str, Callable[[Race, RewardConfig], np.ndarray]] = {
+    "milestone": milestone,
+    "progress": progress,
+    "lap_progress": lap_progress,
+    "collision": collision,
+    "velocity_matching": velocity_matching,
+    "steering_change": steering_change,
+    "speed_change": speed_change,
+    "overtake": overtake,
+}
+
+REWARD_PRESETS: dict[str, dict[str, float]] = {
+    # Learns within minutes: progress, and a smooth hand.
+    "fast": {"progress": 0.1, "collision": 1.0, "steering_change": 0.01, "speed_change": 0.01, "overtake": 1.0},
+    # The paper's terms with its authors' constants. Their collision penalty could not grow (its
+    # maximum was 1, the value it starts from); `collision_max` restores the curriculum that the paper describes.
+    "paper": {
+        "milestone": 5.0,
+        "lap_progress": 100.0,
+        "collision": 1.0,
+        "velocity_matching": 10.0,
+        "steering_change": 0.05,
+        "speed_change": 0.0,
+        "overtake": 20.0,
+    },
+}
+
+
+def reference_speeds(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray) -> np.ndarray:
+    """The speed to match at every row of the atlas: float32 (rows,) [m/s].
+
+    The speed column of the track's raceline, at the arc lengths where its points lie. A track without one
+    gets the speed at which the centreline's curvature asks for LATERAL_SHARE of the grip, braking and
+    accelerating within a_max.
+
+    Args:
+        params: (N_PARAMS,) of a typical car: its mu, a_max and v_max count where there is no raceline.
+    """
+    out = np.empty(len(atlas.line), np.float32)
+    for number, track in enumerate(tracks):
+        first, rows = atlas.index[number, 4], atlas.index[number, 5]
+        spacing, length = atlas.frame[number, 5], track.centerline.length
+        s = np.arange(rows) * spacing
+        if track.raceline is not None:
+            at, _ = track.centerline.to_frenet(track.raceline.x, track.raceline.y)
+            order = np.argsort(at)
+            speed = np.interp(s, at[order], track.raceline.speed[order], period=length)
+        else:
+            speed = _friction_limited(atlas.line[first : first + rows, CURVATURE], spacing, params)
+        out[first : first + rows] = speed
+    return out
+
+
+def _friction_limited(curvature: np.ndarray, spacing: float, params: np.ndarray) -> np.ndarray:
+    """A speed profile around a closed line: cornering limit, then braking backwards and accelerating forwards."""
+    lateral = LATERAL_SHARE * float(params[0]) * GRAVITY
+    squared = np.minimum(lateral / np.maximum(np.abs(curvature), 1e-6), float(params[V_MAX]) ** 2)
+    gain = 2.0 * min(float(params[A_MAX]), lateral) * spacing
+    for order in (range(2 * len(squared), 0, -1), range(2 * len(squared))):
+        before = order[0] % len(squared)
+        for index in order:
+            i = index % len(squared)
+            squared[i] = min(squared[i], squared[before] + gain)
+            before = i
+    return np.sqrt(squared)

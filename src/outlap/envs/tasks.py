@@ -1,0 +1,78 @@
+"""What is drawn anew in every episode: the track and the parameters of every car in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from outlap.errors import OutlapError
+from outlap.seeding import PARAMETER_STREAM, TRACK_STREAM, uniform
+from outlap.simulator.vehicle import (
+    N_PARAMS,
+    SPEED_DELAY,
+    STEER_DELAY,
+    ActuatorParams,
+    LidarParams,
+    VehicleParams,
+    parameter_bounds,
+)
+from outlap.track.track import Track
+
+
+@dataclass(frozen=True, eq=False)
+class TaskSet:
+    """A distribution of tasks: tracks, each as likely as the others, × a range of every parameter."""
+
+    tracks: tuple[Track, ...]
+    vehicle: VehicleParams = field(default_factory=VehicleParams)
+    actuators: ActuatorParams = field(default_factory=ActuatorParams)
+    lidar: LidarParams = field(default_factory=LidarParams)
+
+    def __post_init__(self) -> None:
+        if not self.tracks:
+            raise OutlapError("tracks: none given; at least one is needed")
+
+    @property
+    def max_delay(self) -> float:
+        """The longest actuator delay that a task can have [s]."""
+        _, high = parameter_bounds(self.vehicle, self.actuators, self.lidar)
+        return float(max(high[STEER_DELAY], high[SPEED_DELAY]))
+
+    def draw(self, keys: np.ndarray, episodes: np.ndarray, num_cars: int) -> tuple[np.ndarray, np.ndarray]:
+        """The tasks of some worlds' next episodes; every car's parameters are drawn on their own.
+
+        Args:
+            keys: uint64 (n,) of the worlds, from `seeding.world_keys`.
+            episodes: (n,) number of each world's episode.
+            num_cars: cars a world.
+
+        Returns:
+            tracks: int64 (n,) positions in `tracks`.
+            params: float32 (n, num_cars, N_PARAMS).
+        """
+        choice = uniform(keys, episodes, TRACK_STREAM, 1)[:, 0]
+        low, high = parameter_bounds(self.vehicle, self.actuators, self.lidar)
+        share = uniform(keys, episodes, PARAMETER_STREAM, num_cars * N_PARAMS)
+        share = share.reshape(len(keys), num_cars, N_PARAMS)
+        params = (low + share * (high - low)).astype(np.float32)
+        return (choice * len(self.tracks)).astype(np.int64), np.clip(params, low, high)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskSplit:
+    """Training tasks and held-out tasks. Code that trains is handed `train` and nothing else."""
+
+    train: TaskSet
+    held_out: TaskSet
+
+    def __post_init__(self) -> None:
+        both = {track.name for track in self.train.tracks} & {track.name for track in self.held_out.tracks}
+        if both:
+            raise OutlapError(f"tracks: {sorted(both)} are both trained on and held out; take them from one set")
+
+
+def load_tracks(names: Sequence[str | Track]) -> tuple[Track, ...]:
+    """Tracks by name or path; one that is loaded already is taken as it is."""
+    return tuple(track if isinstance(track, Track) else Track.load(track) for track in names)

@@ -1,0 +1,339 @@
+"""The batched step: one pass over worlds × cars, in parallel over worlds.
+
+Each function takes the tracks (`Atlas`), the constants of a simulator (`Constants`) and the arrays of all
+worlds (`Worlds`), which it changes in place. Nothing is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from outlap.seeding import hash64
+from outlap.simulator import state as column
+from outlap.simulator.actuators import acceleration, delay_steps, lag, steering_rate
+from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
+from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, rectangles_overlap, touches_wall
+from outlap.simulator.dynamics import (
+    KINEMATIC,
+    integrate,
+    kinematic_speed,
+    kinematic_values,
+    rolling_wheel_speeds,
+    wrap_angle,
+)
+from outlap.simulator.lidar import cast_car, cast_walls, spoil
+from outlap.simulator.vehicle import (
+    KINEMATIC_SPEED,
+    LENGTH,
+    MAX_RANGE,
+    MOUNT_X,
+    SPEED_LAG,
+    STEER_LAG,
+    WIDTH,
+)
+from outlap.track.centerline import frenet_point, frenet_project
+
+# Columns of Worlds.frenet
+ARC_LENGTH, OFFSET, HEADING_ERROR = range(3)
+
+
+class Constants(NamedTuple):
+    """What all worlds of a simulator share."""
+
+    model: int  # KINEMATIC, SINGLE_TRACK or DRIFT
+    integrator: int  # EULER or RK4
+    timestep: float  # [s] of physics
+    substeps: int  # integrator steps per physics step
+    beam_cos: np.ndarray  # float32, see `lidar.beam_directions`
+    beam_sin: np.ndarray
+
+
+class Worlds(NamedTuple):
+    """The state of every world; leading axes (worlds, cars)."""
+
+    key: np.ndarray  # uint64 (worlds,) of the random numbers of this episode
+    track: np.ndarray  # int32 (worlds,) number in the atlas
+    time: np.ndarray  # float64 (worlds,) since the reset [s]
+    tick: np.ndarray  # int64 (worlds,) physics steps since the reset
+    params: np.ndarray  # float32 (worlds, cars, N_PARAMS)
+    state: np.ndarray  # float32 (worlds, cars, N_STATE)
+    before: np.ndarray  # float32 (worlds, cars, 3): x, y, yaw one physics step ago
+    delayed: np.ndarray  # float32 (worlds, cars, slots, 2): ring of the latest commands
+    lagged: np.ndarray  # float32 (worlds, cars, 2): commands behind delay and lag
+    frenet: np.ndarray  # float64 (worlds, cars, 3): ARC_LENGTH [m], OFFSET [m], HEADING_ERROR [rad]
+    distance: np.ndarray  # float64 (worlds, cars): arc length driven from the start line, unwrapped [m]
+    next_line: np.ndarray  # int64 (worlds, cars): number of the next crossing of the start line
+    lap_start: np.ndarray  # float64 (worlds, cars): time of the last crossing [s]; NaN on the out-lap
+    laps: np.ndarray  # int64 (worlds, cars): laps completed, from line to line
+    lap_time: np.ndarray  # float64 (worlds, cars): of the last completed lap [s]; NaN before
+    contact: np.ndarray  # uint8 (worlds, cars): FREE, HIT_WALL or HIT_CAR; a car in contact is parked
+    impact_speed: np.ndarray  # float32 (worlds, cars): at the contact [m/s]
+    scan: np.ndarray  # float32 (worlds, cars, beams) [m]
+
+
+@njit(cache=True, error_model="numpy")
+def _drive(constants, worlds, w, c, steer_command, speed_command):
+    """One physics step of one car, walls aside."""
+    p = worlds.params[w, c]
+    state = worlds.state[w, c]
+    dt = constants.timestep
+
+    slots = worlds.delayed.shape[2]
+    slot = worlds.tick[w] % slots
+    worlds.delayed[w, c, slot, 0] = steer_command
+    worlds.delayed[w, c, slot, 1] = speed_command
+    steer_late, speed_late = delay_steps(p, dt)
+    steer_target = worlds.delayed[w, c, (slot - min(steer_late, slots - 1)) % slots, 0]
+    speed_target = worlds.delayed[w, c, (slot - min(speed_late, slots - 1)) % slots, 1]
+    steer_target = lag(worlds.lagged[w, c, 0], steer_target, dt, p[STEER_LAG])
+    speed_target = lag(worlds.lagged[w, c, 1], speed_target, dt, p[SPEED_LAG])
+    worlds.lagged[w, c, 0] = steer_target
+    worlds.lagged[w, c, 1] = speed_target
+
+    worlds.before[w, c, 0] = state[column.X]
+    worlds.before[w, c, 1] = state[column.Y]
+    worlds.before[w, c, 2] = state[column.YAW]
+    now = (
+        float(state[column.X]), float(state[column.Y]), float(state[column.STEER]),
+        float(state[column.SPEED]), float(state[column.YAW]), float(state[column.YAW_RATE]),
+        float(state[column.SLIP]), float(state[column.WHEEL_SPEED_FRONT]),
+        float(state[column.WHEEL_SPEED_REAR]),
+    )  # fmt: skip
+    h = dt / constants.substeps
+    for _ in range(constants.substeps):
+        rate = steering_rate(steer_target, now[column.STEER], h, p)
+        push = acceleration(speed_target, now[column.SPEED], p)
+        now = integrate(constants.model, constants.integrator, now, rate, push, h, p)
+    for k in range(len(now)):
+        state[k] = now[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _collide(atlas, worlds, w):
+    """Find contacts on the way of the last physics step and park the cars that made one."""
+    cars = worlds.state.shape[1]
+    # Poses in between are tested too, no further apart than a car is wide: then nothing can be jumped over.
+    checks = 1
+    for c in range(cars):
+        dx = worlds.state[w, c, column.X] - worlds.before[w, c, 0]
+        dy = worlds.state[w, c, column.Y] - worlds.before[w, c, 1]
+        moved = math.sqrt(dx * dx + dy * dy)
+        checks = max(checks, int(math.ceil(moved / worlds.params[w, c, WIDTH])))
+    track = worlds.track[w]
+    for check in range(1, checks + 1):
+        share = check / checks
+        for c in range(cars):
+            if worlds.contact[w, c] != FREE:
+                continue
+            x, y, yaw = _between(worlds, w, c, share)
+            length, width = 0.5 * worlds.params[w, c, LENGTH], 0.5 * worlds.params[w, c, WIDTH]
+            if touches_wall(atlas, track, x, y, yaw, length, width):
+                _park(worlds, w, c, x, y, yaw, HIT_WALL)
+        for c in range(cars):
+            for other in range(c):
+                if worlds.contact[w, c] != FREE and worlds.contact[w, other] != FREE:
+                    continue
+                x1, y1, yaw1 = _between(worlds, w, c, share)
+                x2, y2, yaw2 = _between(worlds, w, other, share)
+                p1, p2 = worlds.params[w, c], worlds.params[w, other]
+                if rectangles_overlap(
+                    x1, y1, yaw1, 0.5 * p1[LENGTH], 0.5 * p1[WIDTH],
+                    x2, y2, yaw2, 0.5 * p2[LENGTH], 0.5 * p2[WIDTH],
+                ):  # fmt: skip
+                    _park(worlds, w, c, x1, y1, yaw1, HIT_CAR)
+                    _park(worlds, w, other, x2, y2, yaw2, HIT_CAR)
+
+
+@njit(cache=True, error_model="numpy")
+def _between(worlds, w, c, share):
+    """The pose of a car at a share of its last physics step."""
+    state = worlds.state[w, c]
+    x0, y0, yaw0 = worlds.before[w, c, 0], worlds.before[w, c, 1], worlds.before[w, c, 2]
+    turn = wrap_angle(float(state[column.YAW] - yaw0))
+    return (
+        x0 + share * (state[column.X] - x0),
+        y0 + share * (state[column.Y] - y0),
+        yaw0 + share * turn,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _park(worlds, w, c, x, y, yaw, contact):
+    """Stop a car where it made contact; a car that is parked already stays as it is."""
+    if worlds.contact[w, c] != FREE:
+        return
+    state = worlds.state[w, c]
+    worlds.contact[w, c] = contact
+    worlds.impact_speed[w, c] = abs(state[column.SPEED])
+    steer = state[column.STEER]
+    state[:] = 0.0
+    state[column.X], state[column.Y], state[column.YAW] = x, y, wrap_angle(float(yaw))
+    state[column.STEER] = steer
+    worlds.before[w, c, 0], worlds.before[w, c, 1], worlds.before[w, c, 2] = x, y, state[column.YAW]
+
+
+@njit(cache=True, error_model="numpy")
+def _locate(atlas, worlds, w, c):
+    """Project a car on the centreline, from where it was; returns the line's length [m]."""
+    track = worlds.track[w]
+    rows, spacing = atlas.index[track, ROWS], atlas.frame[track, SPACING]
+    state, frenet = worlds.state[w, c], worlds.frenet[w, c]
+    s, d, heading = frenet_project(
+        atlas.line, atlas.index[track, FIRST_ROW], rows, spacing,
+        float(state[column.X]), float(state[column.Y]), frenet[ARC_LENGTH],
+    )  # fmt: skip
+    frenet[ARC_LENGTH] = s
+    frenet[OFFSET] = d
+    frenet[HEADING_ERROR] = wrap_angle(state[column.YAW] - heading)
+    return rows * spacing
+
+
+@njit(cache=True, error_model="numpy")
+def _progress(atlas, constants, worlds, w, c):
+    """Advance a car's unwrapped distance and its lap clock."""
+    s_before = worlds.frenet[w, c, ARC_LENGTH]
+    length = _locate(atlas, worlds, w, c)
+    advance = worlds.frenet[w, c, ARC_LENGTH] - s_before
+    advance -= length * math.floor(advance / length + 0.5)
+    before = worlds.distance[w, c]
+    worlds.distance[w, c] = before + advance
+    line = worlds.next_line[w, c] * length
+    if worlds.distance[w, c] >= line and advance > 0.0:
+        crossed = worlds.time[w] - constants.timestep * (worlds.distance[w, c] - line) / advance
+        if not math.isnan(worlds.lap_start[w, c]):
+            worlds.laps[w, c] += 1
+            worlds.lap_time[w, c] = crossed - worlds.lap_start[w, c]
+        worlds.lap_start[w, c] = crossed
+        worlds.next_line[w, c] += 1
+
+
+@njit(cache=True, error_model="numpy")
+def _scan(atlas, constants, worlds, w, c):
+    """The scan of one car as the world stands."""
+    scan = worlds.scan[w, c]
+    if scan.shape[0] == 0:
+        return
+    p, state = worlds.params[w, c], worlds.state[w, c]
+    yaw = float(state[column.YAW])
+    x = state[column.X] + p[MOUNT_X] * math.cos(yaw)
+    y = state[column.Y] + p[MOUNT_X] * math.sin(yaw)
+    beam_cos, beam_sin = constants.beam_cos, constants.beam_sin
+    cast_walls(atlas, worlds.track[w], x, y, yaw, beam_cos, beam_sin, p[MAX_RANGE], scan)
+    for other in range(worlds.state.shape[1]):
+        if other == c:
+            continue
+        body, size = worlds.state[w, other], worlds.params[w, other]
+        dx, dy = body[column.X] - x, body[column.Y] - y
+        reach = p[MAX_RANGE] + size[LENGTH]
+        if dx * dx + dy * dy < reach * reach:
+            cast_car(
+                x, y, yaw, beam_cos, beam_sin,
+                float(body[column.X]), float(body[column.Y]), float(body[column.YAW]),
+                0.5 * size[LENGTH], 0.5 * size[WIDTH], scan,
+            )  # fmt: skip
+    key = hash64(hash64(worlds.key[w], np.uint64(worlds.tick[w])), np.uint64(c))
+    spoil(p, key, scan)
+
+
+@njit(cache=True, error_model="numpy")
+def _step_world(atlas, constants, worlds, w, commands, repeats):
+    cars = worlds.state.shape[1]
+    for _ in range(repeats):
+        worlds.time[w] += constants.timestep
+        worlds.tick[w] += 1
+        for c in range(cars):
+            if worlds.contact[w, c] == FREE:
+                _drive(constants, worlds, w, c, commands[w, c, 0], commands[w, c, 1])
+        _collide(atlas, worlds, w)
+        for c in range(cars):
+            _progress(atlas, constants, worlds, w, c)
+    for c in range(cars):
+        _scan(atlas, constants, worlds, w, c)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def step_worlds(atlas, constants, worlds, commands, repeats):
+    """Advance every world by `repeats` physics steps under constant commands, then scan.
+
+    Args:
+        atlas, constants, worlds: see above.
+        commands: (worlds, cars, 2) steering angle [rad] and speed [m/s].
+        repeats: physics steps.
+    """
+    for w in prange(worlds.state.shape[0]):
+        _step_world(atlas, constants, worlds, np.int64(w), commands, repeats)
+
+
+@njit(cache=True, error_model="numpy")
+def _place(atlas, constants, worlds, w, c, start):
+    """Put a car on the track, at rest but for its speed along its own axis."""
+    track = worlds.track[w]
+    rows, spacing = atlas.index[track, ROWS], atlas.frame[track, SPACING]
+    x, y, heading = frenet_point(atlas.line, atlas.index[track, FIRST_ROW], rows, spacing, start[0], start[1])
+    p, state = worlds.params[w, c], worlds.state[w, c]
+    p[KINEMATIC_SPEED] = kinematic_speed(p, constants.timestep / constants.substeps, constants.integrator)
+    speed = float(start[3])
+    state[:] = 0.0
+    state[column.X], state[column.Y] = x, y
+    state[column.YAW] = wrap_angle(heading + start[2])
+    state[column.SPEED] = speed
+    if constants.model == KINEMATIC:
+        state[column.YAW_RATE], state[column.SLIP] = kinematic_values(0.0, speed, p)
+    front, rear = rolling_wheel_speeds(0.0, speed, 0.0, 0.0, p)
+    state[column.WHEEL_SPEED_FRONT], state[column.WHEEL_SPEED_REAR] = front, rear
+    worlds.before[w, c, 0], worlds.before[w, c, 1] = x, y
+    worlds.before[w, c, 2] = state[column.YAW]
+    worlds.delayed[w, c, :, 0] = 0.0
+    worlds.delayed[w, c, :, 1] = speed
+    worlds.lagged[w, c, 0] = 0.0
+    worlds.lagged[w, c, 1] = speed
+
+    worlds.frenet[w, c, ARC_LENGTH] = start[0]
+    length = _locate(atlas, worlds, w, c)
+    # Unwrapped as given: of two cars, one before and one behind the line, the right one leads.
+    worlds.distance[w, c] = start[0]
+    from_line = start[0] - length * math.floor(start[0] / length + 0.5)
+    worlds.next_line[w, c] = int(math.floor(start[0] / length)) + 1
+    worlds.lap_start[w, c] = math.nan
+    if abs(from_line) < 1e-3:  # on the line: the first lap is timed from here
+        worlds.next_line[w, c] = int(math.floor(start[0] / length + 0.5)) + 1
+        worlds.lap_start[w, c] = 0.0
+    worlds.laps[w, c] = 0
+    worlds.lap_time[w, c] = math.nan
+    worlds.contact[w, c] = FREE
+    worlds.impact_speed[w, c] = 0.0
+
+
+# Apart from the parallel loop below, in which Numba would lose the assignment of rows.
+@njit(cache=True, error_model="numpy")
+def _reset_world(atlas, constants, worlds, w, key, track, params, starts):
+    worlds.key[w] = key
+    worlds.track[w] = track
+    worlds.time[w] = 0.0
+    worlds.tick[w] = 0
+    for c in range(worlds.state.shape[1]):
+        worlds.params[w, c, :] = params[c]
+        _place(atlas, constants, worlds, w, c, starts[c])
+    _collide(atlas, worlds, w)
+    for c in range(worlds.state.shape[1]):
+        _scan(atlas, constants, worlds, w, c)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def reset_worlds(atlas, constants, worlds, which, keys, tracks, params, starts):
+    """Begin an episode in some worlds and scan.
+
+    Args:
+        atlas, constants, worlds: see above.
+        which: (n,) indices of the worlds.
+        keys: uint64 (n,) of their random numbers.
+        tracks: (n,) numbers in the atlas.
+        params: (n, cars, N_PARAMS).
+        starts: (n, cars, 4) arc length [m], offset [m], heading error [rad], speed [m/s].
+    """
+    for i in prange(which.shape[0]):
+        _reset_world(atlas, constants, worlds, which[i], keys[i], tracks[i], params[i], starts[i])

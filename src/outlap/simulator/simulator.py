@@ -1,0 +1,186 @@
+"""Simulator: owns the arrays of all worlds, checks what comes in, calls the kernels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from outlap.config import Config
+from outlap.errors import OutlapError
+from outlap.simulator import kernels
+from outlap.simulator.atlas import build_atlas
+from outlap.simulator.dynamics import DRIFT, EULER, KINEMATIC, RK4, SINGLE_TRACK
+from outlap.simulator.lidar import beam_directions
+from outlap.simulator.state import N_STATE
+from outlap.simulator.vehicle import N_PARAMS, SPEED_DELAY, STEER_DELAY
+from outlap.track.track import Track
+
+MODELS = {"kinematic": KINEMATIC, "single_track": SINGLE_TRACK, "drift": DRIFT}
+INTEGRATORS = {"euler": EULER, "rk4": RK4}
+MAX_BEAMS = 1080
+MAX_DELAY_STEPS = 1000
+
+
+class SimulatorConfig(Config):
+    """Physics and scanner that all worlds share."""
+
+    model: Literal["kinematic", "single_track", "drift"] = "single_track"
+    integrator: Literal["euler", "rk4"] = "rk4"
+    timestep: float = 0.01  # of physics [s]
+    substeps: int = 1  # integrator steps per physics step
+    beams: int = 540  # 0 to 1080
+    field_of_view: float = 4.7  # between the outermost beams [rad]
+
+
+class Simulator:
+    """Worlds × cars in lock-step.
+
+    The arrays of `worlds` are live: they change with every `step` and `reset`. Copy what is to be kept.
+    """
+
+    def __init__(
+        self,
+        tracks: Sequence[Track],
+        num_worlds: int,
+        num_cars: int = 1,
+        config: SimulatorConfig | None = None,
+        max_delay: float = 0.0,
+    ) -> None:
+        """Allocate the worlds; `reset` each before the first `step`.
+
+        Args:
+            tracks: what `reset` refers to by number.
+            num_worlds, num_cars: at least 1 each.
+            config: physics and scanner.
+            max_delay: the longest actuator delay that will occur [s].
+
+        Raises OutlapError for a value out of range.
+        """
+        config = config or SimulatorConfig()
+        _check(len(tracks) >= 1, "tracks", len(tracks), "at least one track is needed")
+        _check(num_worlds >= 1, "num_worlds", num_worlds, "it must be at least 1")
+        _check(num_cars >= 1, "num_cars", num_cars, "it must be at least 1")
+        _check(0.0 < config.timestep <= 0.1, "timestep", config.timestep, "it must be in (0, 0.1] s")
+        _check(config.substeps >= 1, "substeps", config.substeps, "it must be at least 1")
+        _check(0 <= config.beams <= MAX_BEAMS, "beams", config.beams, f"it must be in [0, {MAX_BEAMS}]")
+        _check(0.0 < config.field_of_view <= 2.0 * np.pi, "field_of_view", config.field_of_view,
+               "it must be in (0, 2 pi] rad")  # fmt: skip
+        slots = round(max_delay / config.timestep) + 1
+        _check(slots <= MAX_DELAY_STEPS, "max_delay", max_delay, f"at most {MAX_DELAY_STEPS} steps are kept")
+        self.config = config
+        self.tracks = tuple(tracks)
+        self.num_worlds = num_worlds
+        self.num_cars = num_cars
+        self.atlas = build_atlas(self.tracks)
+        beam_cos, beam_sin = beam_directions(config.beams, config.field_of_view)
+        self._constants = kernels.Constants(
+            MODELS[config.model], INTEGRATORS[config.integrator], config.timestep, config.substeps,
+            beam_cos, beam_sin,
+        )  # fmt: skip
+        cars = (num_worlds, num_cars)
+        self.worlds = kernels.Worlds(
+            key=np.zeros(num_worlds, np.uint64),
+            track=np.zeros(num_worlds, np.int32),
+            time=np.zeros(num_worlds),
+            tick=np.zeros(num_worlds, np.int64),
+            params=np.zeros((*cars, N_PARAMS), np.float32),
+            state=np.zeros((*cars, N_STATE), np.float32),
+            before=np.zeros((*cars, 3), np.float32),
+            delayed=np.zeros((*cars, slots, 2), np.float32),
+            lagged=np.zeros((*cars, 2), np.float32),
+            frenet=np.zeros((*cars, 3)),
+            distance=np.zeros(cars),
+            next_line=np.zeros(cars, np.int64),
+            lap_start=np.zeros(cars),
+            laps=np.zeros(cars, np.int64),
+            lap_time=np.zeros(cars),
+            contact=np.zeros(cars, np.uint8),
+            impact_speed=np.zeros(cars, np.float32),
+            scan=np.zeros((*cars, config.beams), np.float32),
+        )
+        self._commands = np.zeros((*cars, 2), np.float32)
+        self._started = np.zeros(num_worlds, bool)
+        self.compile_seconds: float | None = None  # of the first call of each kernel, load from cache included
+
+    def reset(
+        self,
+        which: np.ndarray,
+        *,
+        keys: np.ndarray,
+        tracks: np.ndarray,
+        params: np.ndarray,
+        starts: np.ndarray,
+    ) -> None:
+        """Begin an episode in some worlds; their scans are ready afterwards.
+
+        Args:
+            which: (n,) indices of worlds.
+            keys: uint64 (n,), the key of each world's sensor noise.
+            tracks: (n,) positions in `tracks`.
+            params: (n, cars, N_PARAMS), see `vehicle.parameter_bounds`.
+            starts: (n, cars, 4) arc length [m], offset to the left [m], heading error [rad], speed [m/s].
+        """
+        which = np.asarray(which, np.int64)
+        n, cars = len(which), self.num_cars
+        tracks = np.ascontiguousarray(tracks, np.int32)
+        params = np.ascontiguousarray(params, np.float32)
+        starts = np.ascontiguousarray(starts, np.float64)
+        _check_shape("tracks", tracks, (n,))
+        _check_shape("params", params, (n, cars, N_PARAMS))
+        _check_shape("starts", starts, (n, cars, 4))
+        if n == 0:
+            return
+        _check(which.min() >= 0 and which.max() < self.num_worlds, "which", which, "no such world")
+        _check(tracks.min() >= 0 and tracks.max() < len(self.tracks), "tracks", tracks, "no such track")
+        _check(bool(np.isfinite(starts).all()), "starts", "NaN or infinity", "it must be finite")
+        slots = self.worlds.delayed.shape[2]
+        late = params[..., [STEER_DELAY, SPEED_DELAY]].max() / self.config.timestep
+        _check(late < slots - 0.5 + 1e-3, "params", f"a delay of {late:.1f} steps", "raise max_delay")
+        self._timed(
+            kernels.reset_worlds, self.atlas, self._constants, self.worlds, which,
+            np.ascontiguousarray(keys, np.uint64), tracks, params, starts,
+        )  # fmt: skip
+        self._started[which] = True
+
+    def step(self, commands: np.ndarray, repeats: int = 1) -> None:
+        """Advance every world by `repeats` physics steps under constant commands, then scan.
+
+        Args:
+            commands: (worlds, cars, 2) steering angle [rad], left positive, and speed [m/s].
+            repeats: physics steps.
+
+        Raises OutlapError where a command is not finite or a world was never reset.
+        """
+        commands = np.asarray(commands)
+        _check_shape("commands", commands, self._commands.shape)
+        if not np.isfinite(commands).all():
+            world, car, _ = np.argwhere(~np.isfinite(commands))[0]
+            raise OutlapError(
+                f"commands: that of car {car} in world {world} is {commands[world, car].tolist()}; "
+                "a steering angle [rad] and a speed [m/s], both finite, are needed"
+            )
+        if not self._started.all():
+            raise OutlapError(f"world {np.argmin(self._started)} was never reset; call reset before step")
+        self._commands[:] = commands
+        self._timed(kernels.step_worlds, self.atlas, self._constants, self.worlds, self._commands, repeats)
+
+    def _timed(self, kernel, *arguments) -> None:
+        if kernel.signatures:
+            kernel(*arguments)
+            return
+        begin = time.perf_counter()
+        kernel(*arguments)
+        self.compile_seconds = (self.compile_seconds or 0.0) + time.perf_counter() - begin
+
+
+def _check(holds: bool, name: str, value: object, remedy: str) -> None:
+    if not holds:
+        raise OutlapError(f"simulator: {name} is {value}; {remedy}")
+
+
+def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise OutlapError(f"simulator: {name} has shape {array.shape}; it must be {shape}")

@@ -1,0 +1,207 @@
+"""What a car is: its parameters, with units, ranges and presets, and the row that the kernels read.
+
+Every numeric field is a `Number`: a value, or a range (min, max) from which each reset draws anew.
+A car of the simulator is one float32 row of `N_PARAMS` columns; `parameter_bounds` gives the smallest
+and the largest row of a configuration.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+
+from outlap.config import Config, Number, bounded, bounds
+
+# Columns of a car's parameter row. They follow the order of the fields below (a test holds them to it).
+MU = 0
+C_SF = 1
+C_SR = 2
+LF = 3
+LR = 4
+H = 5
+M = 6
+I = 7  # noqa: E741 - the moment of inertia, by the name that the field has everywhere
+WIDTH = 8
+LENGTH = 9
+STEER_MIN = 10
+STEER_MAX = 11
+STEER_RATE_MAX = 12
+A_MAX = 13
+V_SWITCH = 14
+V_MIN = 15
+V_MAX = 16
+WHEEL_RADIUS = 17
+WHEEL_INERTIA = 18
+BRAKE_SPLIT = 19
+ENGINE_SPLIT = 20
+P_CX1 = 21
+P_DX1 = 22
+P_EX1 = 23
+P_KX1 = 24
+P_HX1 = 25
+P_VX1 = 26
+R_BX1 = 27
+R_BX2 = 28
+R_CX1 = 29
+R_EX1 = 30
+R_HX1 = 31
+P_CY1 = 32
+P_DY1 = 33
+P_EY1 = 34
+P_KY1 = 35
+R_BY1 = 36
+R_BY2 = 37
+R_BY3 = 38
+R_CY1 = 39
+R_EY1 = 40
+R_HY1 = 41
+R_VY1 = 42
+R_VY4 = 43
+R_VY5 = 44
+R_VY6 = 45
+STEER_GAIN = 46
+STEER_DELAY = 47
+STEER_LAG = 48
+SPEED_GAIN = 49
+SPEED_DELAY = 50
+SPEED_LAG = 51
+MOUNT_X = 52
+MAX_RANGE = 53
+NOISE_STD = 54
+BIAS = 55
+DROPOUT = 56
+KINEMATIC_SPEED = 57  # [m/s] not the user's: `dynamics.kinematic_speed` of the car, filled at reset
+N_PARAMS = 58
+
+
+Finite = Number  # which Config already keeps finite and in order
+Positive = Annotated[Number, bounded(above=0)]
+Negative = Annotated[Number, bounded(below=0)]
+NonNegative = Annotated[Number, bounded(at_least=0)]
+NonPositive = Annotated[Number, bounded(at_most=0)]
+Fraction = Annotated[Number, bounded(at_least=0, at_most=1)]
+LeftAngle = Annotated[Number, bounded(above=0, below=1.5)]
+RightAngle = Annotated[Number, bounded(above=-1.5, below=0)]
+
+
+class PacejkaTyre(Config):
+    """Magic Formula coefficients of the drift model, without camber.
+
+    The default is the table of the CommonRoad vehicle models (Althoff and Würsching, 2020, table 7: an
+    ADAMS passenger-car tyre). Its peaks are scaled by mu / p_dy1, so that `VehicleParams.mu` is the
+    lateral friction in every model.
+    """
+
+    p_cx1: Positive = 1.6411  # longitudinal shape factor [-]
+    p_dx1: Positive = 1.1739  # longitudinal friction [-]
+    p_ex1: Finite = 0.46403  # longitudinal curvature [-]
+    p_kx1: Positive = 22.303  # longitudinal slip stiffness / load [-]
+    p_hx1: Finite = 0.0012297  # longitudinal horizontal shift [-]
+    p_vx1: Finite = -8.8098e-06  # longitudinal vertical shift / load [1/N]
+    r_bx1: Finite = 13.276  # combined longitudinal: slope [1/rad]
+    r_bx2: Finite = -13.778  # combined longitudinal: slope's change with slip [-]
+    r_cx1: Finite = 1.2568  # combined longitudinal: shape factor [-]
+    r_ex1: Finite = 0.65225  # combined longitudinal: curvature [-]
+    r_hx1: Finite = 0.0050722  # combined longitudinal: shift [rad]
+    p_cy1: Positive = 1.3507  # lateral shape factor [-]
+    p_dy1: Positive = 1.0489  # lateral friction [-]
+    p_ey1: Finite = -0.0074722  # lateral curvature [-]
+    p_ky1: Negative = -21.92  # cornering stiffness / load [1/rad]
+    r_by1: Finite = 7.1433  # combined lateral: slope [-]
+    r_by2: Finite = 9.1916  # combined lateral: slope's change with slip angle [1/rad]
+    r_by3: Finite = -0.027856  # combined lateral: shift of that change [rad]
+    r_cy1: Finite = 1.0719  # combined lateral: shape factor [-]
+    r_ey1: Finite = -0.27572  # combined lateral: curvature [-]
+    r_hy1: Finite = 5.7448e-06  # combined lateral: shift [-]
+    r_vy1: Finite = -0.027825  # side force from longitudinal slip / (mu load) [-]
+    r_vy4: Finite = 12.12  # its change with slip angle [1/rad]
+    r_vy5: Finite = 1.9  # its change with slip: shape [-]
+    r_vy6: Finite = -10.704  # its change with slip: slope [-]
+
+
+class VehicleParams(Config):
+    """A car. The default is the F1TENTH gym's 1:10 car.
+
+    The wheels' radius and inertia, which only the drift model reads, are those of a 1:10 all-wheel-drive
+    chassis: 0.1 m wheels of about 0.12 kg, two an axle, plus the motor's rotor through the gearbox.
+    """
+
+    mu: Positive = 1.0489  # tyre-road friction [-]
+    C_Sf: Positive = 4.718  # cornering stiffness / (mu load), front [1/rad]
+    C_Sr: Positive = 5.4562  # cornering stiffness / (mu load), rear [1/rad]
+    lf: Positive = 0.15875  # centre of gravity to front axle [m]
+    lr: Positive = 0.17145  # centre of gravity to rear axle [m]
+    h: NonNegative = 0.074  # height of the centre of gravity [m]
+    m: Positive = 3.74  # mass [kg]
+    I: Positive = 0.04712  # yaw inertia [kg m^2]  # noqa: E741
+    width: Positive = 0.31  # of the body [m]
+    length: Positive = 0.58  # of the body [m]
+    steer_min: RightAngle = -0.4189  # right stop [rad]
+    steer_max: LeftAngle = 0.4189  # left stop [rad]
+    steer_rate_max: Positive = 3.2  # either way [rad/s]
+    a_max: Positive = 9.51  # either way [m/s^2]
+    v_switch: Positive = 7.319  # above it, power limits acceleration to a_max v_switch / v [m/s]
+    v_min: NonPositive = -5.0  # fastest reverse [m/s]
+    v_max: Positive = 20.0  # fastest forward [m/s]
+    wheel_radius: Positive = 0.0508  # [m]
+    wheel_inertia: Positive = 6e-4  # of an axle about its spin, with its share of the drive train [kg m^2]
+    brake_split: Fraction = 0.5  # front share of the braking torque [-]
+    engine_split: Fraction = 0.5  # front share of the driving torque [-]
+    tyre: PacejkaTyre = PacejkaTyre()  # of the drift model
+
+
+class ActuatorParams(Config):
+    """How commands (steering angle, speed) become a steering rate and an acceleration."""
+
+    steer_gain: Positive = 1e6  # steering rate / angle error; 1 / step or more is bang-bang [1/s]
+    steer_delay: NonNegative = 0.0  # rounded to physics steps [s]
+    steer_lag: NonNegative = 0.0  # time constant of a first-order lag; 0 = none [s]
+    speed_gain: Positive = 10.0  # the F1TENTH gym's: acceleration = gain a_max / v_max, speed error [-]
+    speed_delay: NonNegative = 0.0  # rounded to physics steps [s]
+    speed_lag: NonNegative = 0.0  # time constant of a first-order lag; 0 = none [s]
+
+
+class LidarParams(Config):
+    """Where the scanner sits and what is wrong with its ranges."""
+
+    mount_x: Finite = 0.0  # in front of the centre of gravity [m]
+    max_range: Positive = 30.0  # [m]
+    noise_std: NonNegative = 0.0  # Gaussian, independent per beam [m]
+    bias: Finite = 0.0  # added to every range [m]
+    dropout: Fraction = 0.0  # probability that a beam reads max_range [-]
+
+
+PRESETS: dict[str, VehicleParams] = {
+    "f1tenth": VehicleParams(),
+    "paper": VehicleParams(mu=0.8, a_max=6.34, v_min=-8.0, v_max=8.0),
+}
+
+
+def parameter_bounds(
+    vehicle: VehicleParams, actuators: ActuatorParams | None = None, lidar: LidarParams | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest parameter row of a configuration.
+
+    Args:
+        vehicle: the car.
+        actuators: its actuators; none gives the default ones.
+        lidar: its scanner; none gives the default one.
+
+    Returns:
+        low, high: float32 (N_PARAMS,) each, equal where a value is fixed. Draw uniformly between them.
+        KINEMATIC_SPEED is 0 in both: fill it with `dynamics.kinematic_speed` of each row drawn.
+    """
+    ends = [bounds(value) for value in _numbers(vehicle)]
+    ends += [bounds(value) for value in _numbers(vehicle.tyre)]
+    ends += [bounds(value) for value in _numbers(actuators or ActuatorParams())]
+    ends += [bounds(value) for value in _numbers(lidar or LidarParams())]
+    ends.append((0.0, 0.0))  # KINEMATIC_SPEED
+    table = np.array(ends, dtype=np.float32)
+    return table[:, 0].copy(), table[:, 1].copy()
+
+
+def _numbers(config: Config) -> list[Any]:
+    """The values of the numeric fields, in order; nested configurations left out."""
+    values = [getattr(config, name) for name in type(config).model_fields]
+    return [value for value in values if not isinstance(value, Config)]

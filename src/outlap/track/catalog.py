@@ -1,0 +1,142 @@
+"""Finding a track by name: the folders of OUTLAP_TRACKS, then the user's cache, then the built-in set."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import unicodedata
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from outlap.errors import OutlapError
+from outlap.track import map_io
+from outlap.track.cache import cache_folder
+from outlap.track.generate import (
+    BUILTIN_HELD_OUT,
+    BUILTIN_TRAIN,
+    HELD_OUT_CIRCUITS,
+    TRAINING_CIRCUITS,
+    builtin_track,
+)
+from outlap.track.track import Track
+
+TRACKS_VARIABLE = "OUTLAP_TRACKS"
+
+# What the official archive holds: the circuits of the F1TENTH racetrack collection.
+OFFICIAL_TRACKS = (
+    "Austin", "BrandsHatch", "Budapest", "Catalunya", "Hockenheim", "IMS", "Melbourne", "MexicoCity",
+    "Montreal", "Monza", "MoscowRaceway", "Norisring", "Nuerburgring", "Oschersleben", "Sakhir", "SaoPaulo",
+    "Sepang", "Shanghai", "Silverstone", "Sochi", "Spa", "Spielberg", "YasMarina", "Zandvoort",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrackEntry:
+    """A track that can be loaded by its name."""
+
+    name: str
+    source: Literal["folder", "cache", "builtin"]  # a folder of OUTLAP_TRACKS, the user's cache, generated
+    path: Path | None = None  # its map folder; None for a built-in one
+    split: Literal["train", "held_out"] | None = None  # of the built-in set
+
+    def load(self) -> Track:
+        """The track itself, with this name; OutlapError if its files are not valid."""
+        if self.path is None:
+            return builtin_track(self.name)
+        track = map_io.read_track(self.path)
+        return track if track.name == self.name else replace(track, name=self.name)
+
+    def length(self) -> float:
+        """Length of the centreline [m], read without the map's image; OutlapError if the csv is not valid."""
+        if self.path is None:
+            return (TRAINING_CIRCUITS | HELD_OUT_CIRCUITS)[self.name].length
+        likely = [self.path / f"{name}_centerline.csv" for name in (self.name, self.path.name)]
+        found = [path for path in (*likely, *sorted(self.path.glob("*_centerline.csv"))) if path.is_file()]
+        if not found:
+            raise OutlapError(f"{self.path}: has no {self.name}_centerline.csv; a track needs its centreline")
+        return map_io.read_centerline_csv(found[0]).length
+
+
+def search_path() -> list[Path]:
+    """The folders of map folders, in the order of search; some may not exist. The built-in set comes last."""
+    chosen = os.environ.get(TRACKS_VARIABLE, "").split(os.pathsep)
+    return [*(Path(folder).expanduser() for folder in chosen if folder.strip()), cache_folder()]
+
+
+def list_tracks() -> list[TrackEntry]:
+    """Every track that a name finds, in the order of search; of two with one name, the first."""
+    found: dict[str, TrackEntry] = {}
+    for folder in search_path():
+        source = "cache" if folder == cache_folder() else "folder"
+        for path in _track_folders(folder):
+            name = _name_of(path)
+            found.setdefault(name, TrackEntry(name, source, path))
+    for name in BUILTIN_TRAIN:
+        found.setdefault(name, TrackEntry(name, "builtin", split="train"))
+    for name in BUILTIN_HELD_OUT:
+        found.setdefault(name, TrackEntry(name, "builtin", split="held_out"))
+    return list(found.values())
+
+
+def find_track(name: str) -> Track:
+    """Load the track called `name`: exactly so, else whatever its case, spaces, punctuation and accents.
+
+    Raises:
+        OutlapError: no track has this name, or its files are not valid.
+    """
+    return find_entry(name).load()
+
+
+def find_entry(name: str) -> TrackEntry:
+    """Where `find_track` finds `name`, nothing loaded; raises OutlapError where no track has this name."""
+    entries = list_tracks()
+    for entry in entries:
+        if entry.name == name:
+            return entry
+    key = name_key(name)
+    for entry in entries:
+        if key and name_key(entry.name) == key:
+            return entry
+    raise OutlapError(_not_found(name, entries))
+
+
+def name_key(name: str) -> str:
+    """What remains of a name without case, spaces, punctuation and accents: São Paulo is SaoPaulo."""
+    # Umlauts are written as two letters in the archive's names (Nürburgring, Nuerburgring).
+    composed = unicodedata.normalize("NFC", name).casefold()
+    spelled = composed.replace("ä", "ae").replace("ö", "oe").replace("ü", "ue")
+    return "".join(c for c in unicodedata.normalize("NFKD", spelled) if c.isalnum())
+
+
+def is_track_folder(path: Path) -> bool:
+    """Whether `path` is a folder with a map yaml, valid or not."""
+    return path.is_dir() and bool(map_io.find_yaml_files(path))
+
+
+def _track_folders(folder: Path) -> list[Path]:
+    try:
+        children = sorted(folder.iterdir())
+    except OSError:  # absent or unreadable: _not_found says so
+        return []
+    return [path for path in children if not path.name.startswith(".") and is_track_folder(path)]
+
+
+def _name_of(folder: Path) -> str:
+    """The folder's name, in the spelling of its map file: `Mexico City/MexicoCity_map.yaml` is MexicoCity."""
+    spellings = [path.stem.removesuffix("_map") for path in map_io.find_yaml_files(folder)]
+    return next((name for name in spellings if name_key(name) == name_key(folder.name)), folder.name)
+
+
+def _not_found(name: str, entries: list[TrackEntry]) -> str:
+    by_key = {name_key(candidate): candidate for candidate in (*OFFICIAL_TRACKS, *(e.name for e in entries))}
+    close = [by_key[key] for key in difflib.get_close_matches(name_key(name), by_key, n=3, cutoff=0.6)]
+    available = {entry.name for entry in entries}
+    looked = ", ".join(f"{folder}{'' if folder.is_dir() else ' (absent)'}" for folder in search_path())
+    message = f"no track is called {name!r}"
+    if near := [candidate for candidate in close if candidate in available]:
+        message += f"; did you mean {' or '.join(near)}?"
+    message += f"; looked in {looked} and the built-in set ({TRACKS_VARIABLE} can name more folders)"
+    if official := [candidate for candidate in close if candidate not in available]:
+        message += f"; to download: outlap tracks download {official[0]}"
+    return message

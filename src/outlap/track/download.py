@@ -1,0 +1,220 @@
+"""Tracks from the official F1TENTH archive: verified, and in the cache either wholly or not at all."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import re
+import sys
+import urllib.parse
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from outlap.errors import OutlapError
+from outlap.files import atomic_write
+from outlap.track.archive import ArchiveLimits, extract
+from outlap.track.cache import cache_folder, install, staging
+from outlap.track.catalog import OFFICIAL_TRACKS, is_track_folder, name_key
+from outlap.track.map_io import read_track
+from outlap.track.transfer import Patience, Progress, UnreachableError, fetch
+
+ARCHIVE_URL = "https://api.f1tenth.org/{name}.tar.xz"
+LOCK_FILE = "tracks.lock.json"
+_OFFICIAL = ", ".join(OFFICIAL_TRACKS)
+
+
+@dataclass(frozen=True)
+class LockedArchive:
+    """What an archive was when it was first downloaded; a later download must be the same bytes."""
+
+    url: str
+    sha256: str  # 64 hex digits
+    size_bytes: int
+    date: str  # ISO 8601, UTC
+
+
+@dataclass(frozen=True)
+class DownloadedTrack:
+    """One track of a `download_tracks` call."""
+
+    name: str
+    path: Path
+    status: Literal["downloaded", "present"]  # present: it was in the cache already, nothing was fetched
+    archive: LockedArchive
+
+
+def download_tracks(
+    names: Iterable[str],
+    *,
+    cache: Path | None = None,
+    url_template: str = ARCHIVE_URL,
+    update_lock: bool = False,
+    limits: ArchiveLimits | None = None,
+    patience: Patience | None = None,
+    show_progress: bool = False,
+) -> list[DownloadedTrack]:
+    """Put official tracks into the cache, where their names are found; a track that is there stays as it is.
+
+    The archive publishes no checksums. The SHA-256 of the first download is kept in `tracks.lock.json` in the
+    cache, and a later download of the same name must match it; copy that file to pin them on another machine.
+
+    Args:
+        names: official names, such as Spielberg; case, spaces and accents do not matter.
+        cache: the folder of cached tracks; `cache_folder()` by default.
+        url_template: https, with `{name}`.
+        update_lock: fetch again what is there already, and accept an archive that has changed.
+        limits, patience: of sizes and time.
+        show_progress: a bar on standard error if that is a terminal.
+
+    Raises:
+        OutlapError: one or more names failed; those that did not are in the cache all the same.
+    """
+    cache = cache or cache_folder()
+    limits = limits or ArchiveLimits()
+    official = [_official_name(name) for name in names]
+    done: list[DownloadedTrack] = []
+    failures: list[OutlapError] = []
+    for name in dict.fromkeys(official):
+        url = url_template.replace("{name}", urllib.parse.quote(name))
+        try:
+            with _progress_bar(name, show_progress) as progress:
+                track = _download(name, url, cache, update_lock, limits, patience, progress)
+            done.append(track)
+        except UnreachableError:
+            raise  # the others come from the same server
+        except OSError as error:  # no space, for example: that ends them all
+            raise OutlapError(f"{cache}: cannot be written ({error.strerror or error})") from error
+        except OutlapError as error:
+            hint = "" if name in OFFICIAL_TRACKS else f"; the official tracks are {_OFFICIAL}"
+            failures.append(OutlapError(f"{error}{hint}"))
+    if len(failures) == 1:
+        raise failures[0]
+    if failures:
+        reasons = " | ".join(str(error) for error in failures)
+        raise OutlapError(f"{len(failures)} of {len(failures) + len(done)} tracks failed: {reasons}")
+    return done
+
+
+def read_lock(cache: Path) -> dict[str, LockedArchive]:
+    """The lock file of a cache, by track name; empty where there is none.
+
+    Raises:
+        OutlapError: it is not what `download_tracks` writes.
+    """
+    path = cache / LOCK_FILE
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        locked = {name: LockedArchive(**entry) for name, entry in entries.items()}
+        for archive in locked.values():
+            if not re.fullmatch("[0-9a-f]{64}", archive.sha256):
+                raise ValueError(f"sha256 is {archive.sha256!r}")
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise OutlapError(f"{path}: not a lock file of outlap ({error}); mend it or delete it") from error
+    return locked
+
+
+def _download(
+    name: str,
+    url: str,
+    cache: Path,
+    update_lock: bool,
+    limits: ArchiveLimits,
+    patience: Patience | None,
+    progress: Progress | None,
+) -> DownloadedTrack:
+    folder = cache / name
+    with staging(cache) as prepared:
+        locked = read_lock(cache)
+        if folder.exists():
+            if name not in locked:
+                raise OutlapError(
+                    f"{folder}: is there and was not downloaded; move it away to download {name}"
+                )
+            if not update_lock:
+                return DownloadedTrack(name, folder, "present", locked[name])
+
+        archive = prepared / "archive.tar.xz"
+        sha256, size = fetch(url, archive, limits.packed, patience, progress)
+        if name in locked and sha256 != locked[name].sha256 and not update_lock:
+            raise OutlapError(
+                f"{url}: sha256 is {sha256}, but {cache / LOCK_FILE} has {locked[name].sha256} "
+                f"of {locked[name].date}; if the change is meant, run again with --update-lock"
+            )
+
+        content = prepared / "content"
+        content.mkdir()
+        extract(archive, content, limits, called=url)
+        track_folder = _only_track_folder(content, url)
+        try:
+            read_track(track_folder)
+        except OutlapError as error:
+            raise OutlapError(f"{url}: {str(error).replace(f'{content}/', '')}") from error
+
+        # The digest before the track: after a kill between the two, the next download is still checked.
+        if name not in locked or locked[name].sha256 != sha256:
+            now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+            locked[name] = LockedArchive(url, sha256, size, now)
+            _write_lock(cache, locked)
+        install(track_folder, folder)
+    return DownloadedTrack(name, folder, "downloaded", locked[name])
+
+
+def _official_name(name: str) -> str:
+    """The archive's spelling of a name; one that is not on the list is taken as it is."""
+    for official in OFFICIAL_TRACKS:
+        if name_key(name) == name_key(official):
+            return official
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise OutlapError(
+            f"{name!r} cannot be the name of a track in the archive; the official ones are {_OFFICIAL}"
+        )
+    return name
+
+
+def _only_track_folder(content: Path, url: str) -> Path:
+    folders = [content, *sorted(path for path in content.rglob("*") if path.is_dir())]
+    found = [folder for folder in folders if is_track_folder(folder)]
+    if len(found) != 1:
+        raise OutlapError(
+            f"{url}: holds {len(found)} folders with a map (NAME_map.yaml or NAME.yaml); there must be one"
+        )
+    return found[0]
+
+
+def _write_lock(cache: Path, locked: dict[str, LockedArchive]) -> None:
+    rows = {name: asdict(archive) for name, archive in sorted(locked.items())}
+    atomic_write(cache / LOCK_FILE, json.dumps(rows, indent=2) + "\n")
+
+
+class _Bar(AbstractContextManager[Progress]):
+    """A rich progress bar as a `Progress` callback."""
+
+    def __init__(self, name: str) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            DownloadColumn(),
+            TransferSpeedColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._task = self._bar.add_task(name, total=None)
+
+    def __enter__(self) -> Progress:
+        self._bar.start()
+        return lambda size, total: self._bar.update(self._task, completed=size, total=total)
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+
+def _progress_bar(name: str, wanted: bool) -> AbstractContextManager[Progress | None]:
+    return _Bar(name) if wanted and sys.stderr.isatty() else nullcontext()

@@ -1,0 +1,20 @@
+"""The racing line: where to drive and how fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Raceline:
+    """A closed line sampled along its own arc length; one (n,) array a column of the F1TENTH file."""
+
+    s: np.ndarray  # (n,) [m] along the racing line
+    x: np.ndarray  # (n,) [m]
+    y: np.ndarray  # (n,) [m]
+    heading: np.ndarray  # (n,) [rad], as in the file: not wrapped
+    curvature: np.ndarray  # (n,) [1/m]
+    speed: np.ndarray  # (n,) [m/s]
+    acceleration: np.ndarray  # (n,) [m/s²] longitudinal

@@ -1,0 +1,117 @@
+"""A track: walls on a grid, the centreline, and a racing line where there is one."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from outlap.errors import OutlapError
+from outlap.track.centerline import Centerline
+from outlap.track.distance import wall_distance
+from outlap.track.raceline import Raceline
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """An immutable track.
+
+    The grid's row 0 is the bottom row: y grows with the row index. `origin` is the lower-left corner
+    of the pixel in row 0 and column 0, and the grid is turned about it by its yaw.
+    """
+
+    name: str
+    occupancy: np.ndarray  # (height, width) bool, True = wall; read-only
+    resolution: float  # [m/pixel]
+    origin: tuple[float, float, float]  # x [m], y [m], yaw [rad]
+    centerline: Centerline
+    raceline: Raceline | None = None
+
+    def __post_init__(self) -> None:
+        occupancy = np.array(self.occupancy, dtype=bool, order="C")  # a copy: nobody else can write to it
+        if occupancy.ndim != 2 or occupancy.size == 0:
+            raise OutlapError(
+                f"track {self.name}: occupancy has shape {occupancy.shape}; must be (height, width)"
+            )
+        if not (math.isfinite(self.resolution) and self.resolution > 0.0):
+            raise OutlapError(
+                f"track {self.name}: resolution is {self.resolution}; "
+                "it must be a positive number of metres per pixel"
+            )
+        if len(self.origin) != 3 or not all(map(math.isfinite, self.origin)):
+            raise OutlapError(
+                f"track {self.name}: origin is {self.origin}; it must be (x, y, yaw), all finite"
+            )
+        occupancy.setflags(write=False)
+        object.__setattr__(self, "occupancy", occupancy)
+        object.__setattr__(self, "origin", tuple(map(float, self.origin)))
+
+    @classmethod
+    def load(cls, path_or_name: str | os.PathLike[str]) -> Track:
+        """Load an F1TENTH map folder, a TUM centreline csv, or a track by name.
+
+        A folder or file that exists wins over a name. Raises OutlapError when nothing is found or
+        what is found is not a valid track.
+        """
+        from outlap.track import map_io  # imported late: map_io builds Tracks
+
+        path = Path(path_or_name).expanduser()
+        text = os.fspath(path_or_name)
+        is_bare_name = (
+            isinstance(path_or_name, str) and not {"/", os.sep} & set(text) and text not in (".", "..")
+        )
+        if path.is_file() and path.suffix.lower() == ".csv":
+            return map_io.read_tum_centerline(path)
+        # A folder that merely shares a track's name is not that track.
+        if path.is_dir() and not (is_bare_name and map_io.find_yaml_files(path) == []):
+            return map_io.read_track(path)
+        if is_bare_name and not path.is_file():
+            from outlap.track.catalog import find_track
+
+            return find_track(text)
+        what = "is neither a map folder nor a centreline .csv" if path.is_file() else "does not exist"
+        raise OutlapError(f"{path}: {what}; give a map folder, a centreline .csv or a track's name")
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write the track to `folder` in the F1TENTH format; returns the folder."""
+        from outlap.track import map_io
+
+        return map_io.write_track(self, folder)
+
+    @cached_property
+    def distance_field(self) -> np.ndarray:
+        """How far a ray can go from anywhere in a cell: (height, width) float32 [m].
+
+        The exact distance from the cell's square to the nearest wall square: 0 for a cell that
+        touches one, at a corner too, and -1 in a wall. What lies outside the grid is wall.
+        """
+        field = wall_distance(self.occupancy, self.resolution)
+        field.setflags(write=False)
+        return field
+
+    def world_to_grid(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Map frame [m] → (column, row) as floats; the floor of each is the pixel's index."""
+        x = np.asarray(x, dtype=np.float64) - self.origin[0]
+        y = np.asarray(y, dtype=np.float64) - self.origin[1]
+        cos, sin = math.cos(self.origin[2]), math.sin(self.origin[2])
+        return (cos * x + sin * y) / self.resolution, (cos * y - sin * x) / self.resolution
+
+    def grid_to_world(self, col: ArrayLike, row: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """(column, row) as floats → map frame [m]; a pixel's centre is at its index + 0.5."""
+        u = np.asarray(col, dtype=np.float64) * self.resolution
+        v = np.asarray(row, dtype=np.float64) * self.resolution
+        cos, sin = math.cos(self.origin[2]), math.sin(self.origin[2])
+        return self.origin[0] + cos * u - sin * v, self.origin[1] + sin * u + cos * v
+
+    def is_wall(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Whether each point (map frame, [m]) lies in a wall; outside the map counts as wall."""
+        col, row = self.world_to_grid(x, y)
+        height, width = self.occupancy.shape
+        inside = (col >= 0.0) & (col < width) & (row >= 0.0) & (row < height)
+        col, row = np.where(inside, col, 0.0).astype(np.intp), np.where(inside, row, 0.0).astype(np.intp)
+        return ~inside | self.occupancy[row, col]

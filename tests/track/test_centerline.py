@@ -1,0 +1,338 @@
+"""The centreline against closed forms, brute force and its own inverse; the kernels against the class."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.special import ellipe
+
+from outlap.errors import OutlapError
+from outlap.track.centerline import (
+    CURVATURE,
+    TABLE_COLUMNS,
+    TANGENT_X,
+    TANGENT_Y,
+    WIDTH_LEFT,
+    WIDTH_RIGHT,
+    Centerline,
+    X,
+    Y,
+    frenet_point,
+    frenet_project,
+    table_value,
+)
+
+CIRCUITS = [
+    "BrandsHatch",
+    "Hockenheim",
+    "IMS",
+    "Monza",
+    "Nuerburgring",
+    "Silverstone",
+    "Spielberg",
+    "YasMarina",
+    "Zandvoort",
+    "levine",
+]
+
+
+def ellipse(count: int, a: float = 30.0, b: float = 12.0) -> tuple[np.ndarray, np.ndarray]:
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    return angle, np.column_stack([a * np.cos(angle), b * np.sin(angle)])
+
+
+def wavy(count: int = 240) -> Centerline:
+    """A closed line with bends of both signs, radius down to about 2 m."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    radius = 20.0 + 3.0 * np.sin(5.0 * angle) + 1.0 * np.cos(3.0 * angle)
+    return Centerline.from_points(
+        np.column_stack([radius * np.cos(angle) + 7.0, radius * np.sin(angle) - 4.0]), 1.0, 1.2
+    )
+
+
+def circular(difference: np.ndarray, length: float) -> np.ndarray:
+    return (difference + 0.5 * length) % length - 0.5 * length
+
+
+def brute_force_frenet(line: Centerline, x: float, y: float) -> tuple[float, float]:
+    """The nearest of samples 1 mm apart, and the distance to it."""
+    s = np.linspace(0.0, line.length, math.ceil(line.length / 1e-3), endpoint=False)
+    position = line.position(s)
+    distance = np.hypot(position[:, 0] - x, position[:, 1] - y)
+    nearest = int(np.argmin(distance))
+    return s[nearest], distance[nearest]
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0], ids=["anticlockwise", "clockwise"])
+def test_circle_has_its_length_heading_and_curvature(direction: float) -> None:
+    radius = 5.0
+    angle = direction * np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+    line = Centerline.from_points(radius * np.column_stack([np.cos(angle), np.sin(angle)]), 1.0, 1.0)
+    s = np.linspace(-3.0, 50.0, 1001)  # wraps round at both ends
+    turned = direction * s / radius
+    assert line.length == pytest.approx(2.0 * np.pi * radius, abs=1e-6)
+    np.testing.assert_allclose(
+        line.position(s), radius * np.column_stack([np.cos(turned), np.sin(turned)]), atol=1e-6
+    )
+    np.testing.assert_allclose(line.curvature(s), direction / radius, rtol=1e-3)
+    heading = line.heading(s)
+    assert np.all((heading > -np.pi) & (heading <= np.pi))
+    np.testing.assert_allclose(np.exp(1j * (heading - turned)), direction * 1j, atol=1e-5)
+
+
+def test_ellipse_has_its_circumference_and_curvature() -> None:
+    a, b = 30.0, 12.0
+    angle, points = ellipse(400, a, b)
+    line = Centerline.from_points(points, 1.0, 1.0)
+    assert line.length == pytest.approx(4.0 * a * ellipe(1.0 - (b / a) ** 2), abs=1e-4)
+    speed = np.hypot(a * np.sin(angle), b * np.cos(angle))
+    np.testing.assert_allclose(line.curvature(line.s), a * b / speed**3, rtol=2e-3)
+    np.testing.assert_allclose(
+        np.exp(1j * line.heading(line.s)), (-a * np.sin(angle) + 1j * b * np.cos(angle)) / speed, atol=1e-5
+    )
+
+
+def test_s_is_true_arc_length_though_the_points_are_unevenly_spread() -> None:
+    rng = np.random.default_rng(3)
+    angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 150))
+    line = Centerline.from_points(np.column_stack([20.0 * np.cos(angle), 9.0 * np.sin(angle)]), 1.0, 1.0)
+    s = np.linspace(0.0, line.length, 200_001)
+    walked = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line.position(s), axis=0).T))])
+    np.testing.assert_allclose(walked, s, atol=1e-4)
+
+
+def test_the_line_goes_through_its_points_and_starts_at_the_first() -> None:
+    _, points = ellipse(60)
+    line = Centerline.from_points(points, 1.0, 1.0)
+    assert line.s[0] == 0.0
+    np.testing.assert_allclose(line.position(line.s), points, atol=1e-9)
+    np.testing.assert_allclose(line.position(line.length), points[0], atol=1e-9)
+
+
+def test_a_closed_last_point_and_repeated_points_change_nothing() -> None:
+    _, points = ellipse(60)
+    widths = np.linspace(0.5, 1.5, 60)
+    plain = Centerline.from_points(points, widths, 1.0)
+    closed = Centerline.from_points(np.vstack([points, points[:1]]), np.append(widths, widths[0]), 1.0)
+    order = np.concatenate([[0, 0], np.arange(1, 30), [29, 29], np.arange(30, 60), [0, 0]])
+    repeated = Centerline.from_points(points[order], widths[order], 1.0)
+    for other in (closed, repeated):
+        np.testing.assert_array_equal(other.points, points)
+        np.testing.assert_array_equal(other.width_right, widths)
+        assert other.length == plain.length
+
+
+def test_widths_are_linear_between_points_and_over_the_start_line() -> None:
+    _, points = ellipse(8)
+    line = Centerline.from_points(points, np.arange(8.0), 2.0)
+    middle = 0.5 * (line.s[2] + line.s[3])
+    right, left = line.widths([middle, 0.5 * (line.s[7] + line.length), -0.5 * (line.length - line.s[7])])
+    np.testing.assert_allclose(right, [2.5, 3.5, 3.5])
+    np.testing.assert_allclose(left, 2.0)
+
+
+def test_to_cartesian_puts_positive_offsets_on_the_left() -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
+    line = Centerline.from_points(5.0 * np.column_stack([np.cos(angle), np.sin(angle)]), 1.0, 1.0)
+    # driven anticlockwise, the centre is on the left
+    np.testing.assert_allclose(line.to_cartesian(0.0, 1.0), [4.0, 0.0], atol=1e-5)
+    np.testing.assert_allclose(line.to_frenet(6.0, 0.0), (0.0, -1.0), atol=1e-5)
+
+
+def test_to_frenet_finds_the_globally_nearest_point() -> None:
+    line = wavy()
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(-20.0, 34.0, 60), rng.uniform(-31.0, 23.0, 60)
+    s, d = line.to_frenet(x, y)
+    for i in range(60):
+        _, distance = brute_force_frenet(line, x[i], y[i])
+        assert abs(d[i]) <= distance + 1e-9
+        assert abs(d[i]) == pytest.approx(distance, abs=1e-5)
+    np.testing.assert_allclose(line.to_cartesian(s, d), np.column_stack([x, y]), atol=1e-6)
+
+
+def test_to_frenet_keeps_shapes() -> None:
+    line = wavy()
+    assert line.to_frenet(np.zeros((2, 3)), np.zeros((2, 3)))[0].shape == (2, 3)
+    assert line.to_frenet(1.0, 2.0)[1].shape == ()
+    assert line.to_cartesian(np.zeros((2, 3)), 0.1).shape == (2, 3, 2)
+
+
+def check_round_trip(line: Centerline) -> None:
+    rng = np.random.default_rng(5)
+    s = np.concatenate([rng.uniform(0.0, line.length, 20_000), [0.0, 1e-9, line.length - 1e-9]])
+    right, left = line.widths(s)
+    d = rng.uniform(-right, left)
+    x, y = line.to_cartesian(s, d).T
+    s_back, d_back = line.to_frenet(x, y)
+    assert np.all((s_back >= 0.0) & (s_back < line.length))
+    np.testing.assert_allclose(line.to_cartesian(s_back, d_back), np.column_stack([x, y]), atol=1e-6)
+    assert np.all(np.abs(d_back) <= np.abs(d) + 1e-9)  # never a point further away
+    nearest = (np.abs(d_back) > np.abs(d) - 1e-6) & (np.abs(d * line.curvature(s)) < 0.99)
+    assert nearest.mean() > 0.98
+    np.testing.assert_allclose(circular(s_back - s, line.length)[nearest], 0.0, atol=1e-3)
+    np.testing.assert_allclose((d_back - d)[nearest], 0.0, atol=1e-3)
+
+
+def test_frenet_round_trip() -> None:
+    check_round_trip(wavy())
+
+
+@pytest.mark.parametrize("circuit", CIRCUITS)
+def test_frenet_round_trip_on_real_circuits(real_tracks: Path, circuit: str) -> None:
+    from outlap.track import Track
+
+    if not (real_tracks / circuit).is_dir():
+        pytest.skip(f"needs real circuits: OUTLAP_TRACKS has no {circuit}")
+    check_round_trip(Track.load(real_tracks / circuit).centerline)
+
+
+def test_points_traced_on_pixels_make_a_line_that_a_car_can_follow() -> None:
+    # a rounded rectangle, its corners 1 m in radius, each point moved to its 0.05 m pixel
+    quarter = np.linspace(0.0, np.pi / 2.0, 40)
+    corners = [(8.0, 3.0, 0.0), (-8.0, 3.0, 0.5), (-8.0, -3.0, 1.0), (8.0, -3.0, 1.5)]
+    arcs = [
+        np.column_stack([x + np.cos(quarter + turn * np.pi), y + np.sin(quarter + turn * np.pi)])
+        for x, y, turn in corners
+    ]
+    clean = Centerline.from_points(np.vstack(arcs), 1.0, 1.0)
+    exact = clean.position(np.arange(0.0, clean.length, 0.04))
+    pixels = np.round(exact / 0.05) * 0.05
+    _, first = np.unique(np.round(pixels / 0.05).astype(int), axis=0, return_index=True)
+    line = Centerline.from_points(pixels[np.sort(first)], 1.0, 1.0)
+    s = np.arange(0.0, line.length, 0.01)
+    assert np.abs(line.curvature(s)).max() <= 1.0 / 0.19
+    s_clean, d = clean.to_frenet(*line.position(s).T)
+    assert np.abs(d).max() < 0.15
+    turned = np.angle(np.exp(1j * (line.heading(s) - clean.heading(s_clean))))
+    assert np.abs(turned).max() < 0.35  # the pixels themselves turn by 0.8 at a time
+
+
+@pytest.mark.parametrize(
+    ("points", "right", "message"),
+    [
+        (np.zeros((3, 2)) + np.arange(3)[:, None], 1.0, "3 distinct points; .* at least 4"),
+        (np.zeros((9, 2)), 1.0, "1 distinct points"),
+        (np.zeros((5, 3)), 1.0, r"shape \(5, 3\)"),
+        ([[0, 0], [1, 0], [1, np.nan], [0, 1]], 1.0, "y_m of point 3 is nan; it must be finite"),
+        ([[0, 0], [np.inf, 0], [1, 1], [0, 1]], 1.0, "x_m of point 2 is inf"),
+        ([[0, 0], [1, 0], [1, 1], [0, 1]], [1, 1, -0.5, 1], r"w_tr_right_m of point 3 is -0.5"),
+        ([[0, 0], [1, 0], [1, 1], [0, 1]], [1, 1], r"w_tr_right_m has shape \(2,\)"),
+    ],
+)
+def test_bad_points_are_named(points: object, right: object, message: str) -> None:
+    with pytest.raises(OutlapError, match=message):
+        Centerline.from_points(points, right, 1.0)  # type: ignore[arg-type]
+
+
+def test_table_is_uniform_in_s_and_holds_the_line() -> None:
+    line = wavy()
+    table = line.table(0.1)
+    h = line.length / len(table)
+    assert table.dtype == np.float32
+    assert table.shape[1] == TABLE_COLUMNS
+    assert 0.09 < h <= 0.1
+    s = np.arange(len(table)) * h
+    np.testing.assert_allclose(table[:, [X, Y]], line.position(s), atol=1e-5)
+    np.testing.assert_allclose(
+        table[:, [TANGENT_X, TANGENT_Y]],
+        np.column_stack([np.cos(line.heading(s)), np.sin(line.heading(s))]),
+        atol=1e-6,
+    )
+    np.testing.assert_allclose(table[:, CURVATURE], line.curvature(s), atol=1e-6)
+    np.testing.assert_allclose(table[:, [WIDTH_RIGHT, WIDTH_LEFT]], np.tile([1.0, 1.2], (len(s), 1)))
+    with pytest.raises(OutlapError, match="spacing is 0"):
+        line.table(0.0)
+
+
+@njit
+def project_all(table, row0, rows, h, x, y, guess):
+    out = np.empty((len(x), 3))
+    for i in range(len(x)):
+        out[i] = frenet_project(table, row0, rows, h, x[i], y[i], guess[i])
+    return out
+
+
+@njit
+def point_all(table, row0, rows, h, s, d):
+    out = np.empty((len(s), 3))
+    for i in range(len(s)):
+        out[i] = frenet_point(table, row0, rows, h, s[i], d[i])
+    return out
+
+
+def check_kernels(line: Centerline, before: int, widest: float) -> None:
+    """Project from guesses 0.5 m off either way, start line included; and back."""
+    own = line.table()
+    rows, h = len(own), line.length / len(own)
+    table = np.full((before + rows + 3, TABLE_COLUMNS), 1e6, np.float32)  # others' rows: never to be read
+    table[before : before + rows] = own
+    rng = np.random.default_rng(6)
+    near_start = np.linspace(-0.6, 0.6, 500) % line.length
+    s = np.concatenate([rng.uniform(0.0, line.length, 5000), near_start])
+    right, left = line.widths(s)
+    d = rng.uniform(-np.minimum(right, widest), np.minimum(left, widest))
+    # inside the tightest bend around, so that no other point near the guess is nearest too
+    around = np.abs(line.curvature(s[:, None] + np.linspace(-1.0, 1.0, 41))).max(axis=1)
+    d = np.where(np.abs(d) * around < 0.6, d, 0.0)
+    x, y = line.to_cartesian(s, d).T
+    for off in (-0.5, 0.0, 0.5):
+        found = project_all(table, before, rows, h, x, y, s + off)
+        assert np.all((found[:, 0] >= 0.0) & (found[:, 0] < line.length))
+        np.testing.assert_allclose(circular(found[:, 0] - s, line.length), 0.0, atol=5e-4)
+        np.testing.assert_allclose(found[:, 1], d, atol=2e-4)
+        np.testing.assert_allclose(np.exp(1j * (found[:, 2] - line.heading(s))), 1.0, atol=2e-3)
+        back = point_all(table, before, rows, h, found[:, 0], found[:, 1])
+        np.testing.assert_allclose(back[:, :2], np.column_stack([x, y]), atol=1e-4)
+        np.testing.assert_allclose(np.exp(1j * (back[:, 2] - found[:, 2])), 1.0, atol=1e-4)
+
+
+def test_kernels_match_the_class_and_each_other() -> None:
+    check_kernels(wavy(), before=17, widest=1.2)
+
+
+def test_kernels_match_the_class_on_real_circuits(real_tracks: Path) -> None:
+    from outlap.track import Track
+
+    for folder in sorted(path for path in real_tracks.iterdir() if path.is_dir())[:10]:
+        check_kernels(Track.load(folder).centerline, before=5, widest=0.8)
+
+
+def test_frenet_project_walks_from_a_far_guess() -> None:
+    line = wavy()
+    table = line.table()
+    h = line.length / len(table)
+    s = np.linspace(0.0, line.length, 50, endpoint=False)
+    x, y = line.position(s).T
+    found = project_all(table, 0, len(table), h, x, y, s + 1.5)
+    np.testing.assert_allclose(circular(found[:, 0] - s, line.length), 0.0, atol=1e-3)
+
+
+def test_frenet_project_stays_inside_the_table_whatever_it_is_given() -> None:
+    line = wavy()
+    table = line.table()
+    rows, h = len(table), line.length / len(table)
+    awkward = [0.0, -1e-12, line.length, np.nextafter(line.length, 0.0), -1e9, 1e30, np.nan, np.inf]
+    for x in (0.0, 1e12, np.nan, -np.inf):
+        for guess in awkward:
+            s, d, heading = frenet_project(table, 0, rows, h, x, 3.0, guess)
+            assert 0.0 <= s < line.length
+            assert not math.isfinite(x) or (math.isfinite(d) and math.isfinite(heading))
+    for s in awkward:
+        assert np.all(np.isfinite(frenet_point(table, 0, rows, h, s, 0.5)))
+        assert math.isfinite(table_value(table, 0, rows, h, s, CURVATURE))
+
+
+def test_table_value_is_linear_between_rows() -> None:
+    line = wavy()
+    table = np.vstack([np.zeros((4, TABLE_COLUMNS), np.float32), line.table()])
+    rows = len(table) - 4
+    h = line.length / rows
+    s = np.random.default_rng(7).uniform(-1.0, line.length + 1.0, 300)
+    expected = np.interp(s, np.arange(rows) * h, table[4:, CURVATURE], period=line.length)
+    got = [table_value(table, 4, rows, h, value, CURVATURE) for value in s]
+    np.testing.assert_allclose(got, expected, atol=1e-6)
