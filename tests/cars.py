@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from functools import cache
+from typing import Any
 
 import numpy as np
 from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
@@ -16,11 +17,12 @@ SMALL_CAR = 0  # the package has no 1:10 car: its BMW with the F1TENTH car's num
 
 
 @cache
-def package_car(number: int):
+def package_car(number: int) -> Any:
     """Parameters in the package's form: its cars 1 to 3, or SMALL_CAR."""
     if number != SMALL_CAR:
         return setup_vehicle_parameters(number)
-    car, small = copy.deepcopy(setup_vehicle_parameters(2)), VehicleParams()
+    car: Any = copy.deepcopy(setup_vehicle_parameters(2))
+    small: Any = VehicleParams()
     car.a, car.b, car.h_s, car.m, car.I_z = small.lf, small.lr, small.h, small.m, small.I
     car.R_w, car.I_y_w = small.wheel_radius, small.wheel_inertia
     car.T_sb, car.T_se = small.brake_split, small.engine_split

@@ -114,7 +114,8 @@ def observe(race: Race, car: int, terms: Sequence[str], scaled: bool) -> dict[st
         term = OBSERVATION_TERMS[name]
         value = term.read(race, car)
         if scaled:
-            observation[name] = np.multiply(value, 1.0 / np.float32(term.scale), dtype=np.float32)
+            # Divided as the space's bounds are: times the reciprocal could round to just outside of them.
+            observation[name] = np.divide(value, np.float32(term.scale), dtype=np.float32)
         else:
             observation[name] = np.array(value, dtype=np.float32)
     return observation

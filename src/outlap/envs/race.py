@@ -43,7 +43,14 @@ class Race:
         worlds, cars = simulator.num_worlds, simulator.num_cars
         self.actions = np.zeros((worlds, cars, 2), np.float32)
         self.actions_before = np.zeros((worlds, cars, 2), np.float32)
-        for name in ("start", "distance_before", "farthest", "farthest_before", "farthest_time", "stall_mark"):
+        for name in (
+            "start",
+            "distance_before",
+            "farthest",
+            "farthest_before",
+            "farthest_time",
+            "stall_mark",
+        ):
             setattr(self, name, np.zeros(worlds))
         self.ahead = np.zeros((worlds, cars), bool)
         self.places_gained = np.zeros(worlds, np.int64)

@@ -88,7 +88,11 @@ class RaceVectorEnv(VectorEnv):
         self.num_envs = num_envs
         self.render_mode = None
         interval = self.config.control_interval * self.config.timestep
-        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": [], "render_fps": round(1 / interval)}
+        self.metadata = {
+            "autoreset_mode": self.autoreset_mode,
+            "render_modes": [],
+            "render_fps": round(1 / interval),
+        }
 
         self.tasks = TaskSet(loaded, self.config.vehicle, self.config.actuators, self.config.lidar)
         simulator = Simulator(loaded, num_envs, self.config.num_cars, self.config, self.tasks.max_delay)
@@ -161,7 +165,7 @@ class RaceVectorEnv(VectorEnv):
 
         info = self._info(outcome)
         over = terminated | truncated
-        self._over = over
+        self._over = over.copy()  # which the next reset changes
         if over.any() and self.autoreset_mode == AutoresetMode.SAME_STEP:
             final = self._observe()
             final_info = {name: value.copy() for name, value in info.items() if not name.startswith("_")}
@@ -214,7 +218,11 @@ class RaceVectorEnv(VectorEnv):
             # The later the attempt, the nearer to the centreline: a narrow place ends the loop all the same.
             spread = 1.0 - attempt / (START_ATTEMPTS - 1)
             starts = self._draw_starts(
-                keys[waiting], episodes[waiting] * START_ATTEMPTS + attempt, tracks[waiting], params[waiting], spread
+                keys[waiting],
+                episodes[waiting] * START_ATTEMPTS + attempt,
+                tracks[waiting],
+                params[waiting],
+                spread,
             )
             self.race.simulator.reset(
                 which[waiting], keys=noise_keys[waiting], tracks=tracks[waiting], params=params[waiting],

@@ -13,8 +13,8 @@ from pydantic import Field, field_validator, model_validator
 
 from outlap.config import Config
 from outlap.envs.race import EGO, Race
-from outlap.simulator.atlas import Atlas
-from outlap.simulator.vehicle import A_MAX, V_MAX
+from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
+from outlap.simulator.vehicle import A_MAX, MU, V_MAX
 from outlap.track.centerline import CURVATURE
 from outlap.track.track import Track
 
@@ -29,7 +29,7 @@ class RewardConfig(Config):
     """
 
     preset: Literal["fast", "paper"] = "fast"  # where weights come from
-    weights: dict[str, float] = {}  # by term, in place of the preset's
+    weights: dict[str, float] = Field(default={})  # by term, in place of the preset's
     milestones: int = Field(default=10, ge=1)  # per lap
     collision_max: float = Field(default=10.0, ge=1)  # to which the collision penalty grows; 1 = never grows
     collision_steps: float = Field(default=1e5, gt=0)  # over which it grows
@@ -115,7 +115,13 @@ REWARD_TERMS: dict[str, Callable[[Race, RewardConfig], np.ndarray]] = {
 
 REWARD_PRESETS: dict[str, dict[str, float]] = {
     # Learns within minutes: progress, and a smooth hand.
-    "fast": {"progress": 0.1, "collision": 1.0, "steering_change": 0.01, "speed_change": 0.01, "overtake": 1.0},
+    "fast": {
+        "progress": 0.1,
+        "collision": 1.0,
+        "steering_change": 0.01,
+        "speed_change": 0.01,
+        "overtake": 1.0,
+    },
     # The paper's terms with its authors' constants. Their collision penalty could not grow (its
     # maximum was 1, the value it starts from); `collision_max` restores the curriculum that the paper describes.
     "paper": {
@@ -142,8 +148,8 @@ def reference_speeds(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray
     """
     out = np.empty(len(atlas.line), np.float32)
     for number, track in enumerate(tracks):
-        first, rows = atlas.index[number, 4], atlas.index[number, 5]
-        spacing, length = atlas.frame[number, 5], track.centerline.length
+        first, rows = atlas.index[number, FIRST_ROW], atlas.index[number, ROWS]
+        spacing, length = atlas.frame[number, SPACING], track.centerline.length
         s = np.arange(rows) * spacing
         if track.raceline is not None:
             at, _ = track.centerline.to_frenet(track.raceline.x, track.raceline.y)
@@ -157,7 +163,7 @@ def reference_speeds(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray
 
 def _friction_limited(curvature: np.ndarray, spacing: float, params: np.ndarray) -> np.ndarray:
     """A speed profile around a closed line: cornering limit, then braking backwards and accelerating forwards."""
-    lateral = LATERAL_SHARE * float(params[0]) * GRAVITY
+    lateral = LATERAL_SHARE * float(params[MU]) * GRAVITY
     squared = np.minimum(lateral / np.maximum(np.abs(curvature), 1e-6), float(params[V_MAX]) ** 2)
     gain = 2.0 * min(float(params[A_MAX]), lateral) * spacing
     for order in (range(2 * len(squared), 0, -1), range(2 * len(squared))):

@@ -1,0 +1,1 @@
+"""Evaluation: a driver and tracks → a row an episode → a summary with intervals."""

@@ -1,9 +1,9 @@
 """Tracks, packed into the flat arrays that the kernels read.
 
 Walls and clearance are one byte a cell: 255 in a wall, otherwise how far a ray can safely go from anywhere
-in the cell, in quarters of a cell, rounded down. Bytes are kept in tiles of 8 × 8 cells, so that a tile is a
-cache line and a ray in any direction stays in few of them; four bytes make one word, which is what processors
-gather. Every grid has a ring of wall cells, so that no ray needs a bounds test.
+in the cell, in quarters of a cell, rounded down. Four cells, one above the other, make a word: that is what
+processors gather, and a cache line then holds 16 × 4 cells, so that rays in any direction stay in few lines.
+Every grid has a ring of wall cells, so that no ray needs a bounds test.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from outlap.errors import OutlapError
 from outlap.track.centerline import TABLE_COLUMNS
 from outlap.track.track import Track
 
-TILE = 8  # cells along a tile's side
+STACK = 4  # cells in a word, one above the other
 RING = 1  # wall cells around the grid
 WALL = 255  # byte of a wall cell
 QUARTER = 0.25  # [cells] unit of clearance
@@ -29,7 +28,7 @@ LINE_SPACING = 0.1  # [m] between rows of a centreline's table
 # Columns of Atlas.frame
 ORIGIN_X, ORIGIN_Y, COS, SIN, RESOLUTION, SPACING = range(6)
 # Columns of Atlas.index
-FIRST_TILE, TILES_ACROSS, GRID_WIDTH, GRID_HEIGHT, FIRST_ROW, ROWS = range(6)
+FIRST_WORD, GRID_WIDTH, GRID_HEIGHT, FIRST_ROW, ROWS = range(5)
 
 
 class Atlas(NamedTuple):
@@ -37,56 +36,53 @@ class Atlas(NamedTuple):
 
     words: np.ndarray  # uint32: the cells of all grids, four a word
     line: np.ndarray  # float32 (rows, TABLE_COLUMNS): the centreline tables of all tracks
-    index: np.ndarray  # int64 (tracks, 6): where each track lies in the two above
+    index: np.ndarray  # int64 (tracks, 5): where each track lies in the two above
     frame: np.ndarray  # float64 (tracks, 6): grid origin [m] and yaw, cell size and row spacing [m]
 
 
 def build_atlas(tracks: Sequence[Track]) -> Atlas:
     """Pack tracks; the position of a track in `tracks` is its number in the kernels."""
     words, lines = [], []
-    index = np.zeros((len(tracks), 6), dtype=np.int64)
+    index = np.zeros((len(tracks), 5), dtype=np.int64)
     frame = np.zeros((len(tracks), 6))
-    tiles = rows = 0
+    first_word = first_row = 0
     for number, track in enumerate(tracks):
-        cells, across = _pack_cells(track)
+        cells = _pack_cells(track)
         line = track.centerline.table(LINE_SPACING)
         assert line.shape[1] == TABLE_COLUMNS
         height, width = track.occupancy.shape
-        index[number] = tiles, across, width + 2 * RING, height + 2 * RING, rows, len(line)
+        index[number] = first_word, width + 2 * RING, height + 2 * RING, first_row, len(line)
         yaw = track.origin[2]
         frame[number] = (
             track.origin[0], track.origin[1], math.cos(yaw), math.sin(yaw),
             track.resolution, track.centerline.length / len(line),
         )  # fmt: skip
-        tiles += cells.size // TILE**2
-        rows += len(line)
-        words.append(cells.view(np.uint32))
+        first_word += len(cells)
+        first_row += len(line)
+        words.append(cells)
         lines.append(line)
-    if tiles * TILE**2 >= 2**32:
-        raise OutlapError(f"tracks: {len(tracks)} of them have {tiles * TILE**2:,} cells; at most 4 billion fit")
     return Atlas(np.concatenate(words), np.concatenate(lines), index, frame)
 
 
-def _pack_cells(track: Track) -> tuple[np.ndarray, int]:
-    """The bytes of a track's grid in tile order, and the number of tiles across."""
+def _pack_cells(track: Track) -> np.ndarray:
+    """The words of a track's grid, row of words by row of words: uint32 (n,)."""
     clearance = track.distance_field * np.float32(1.0 / (track.resolution * QUARTER))
     # A distance in whole cells must not lose a quarter to rounding.
     code = np.minimum(np.floor(clearance + np.float32(1e-3)), LARGEST_CLEARANCE).astype(np.int16)
     code[track.occupancy] = WALL
     height, width = code.shape
-    down, across = -(-(height + 2 * RING) // TILE), -(-(width + 2 * RING) // TILE)
-    cells = np.full((down * TILE, across * TILE), WALL, dtype=np.uint8)
+    down = -(-(height + 2 * RING) // STACK)
+    cells = np.full((down * STACK, width + 2 * RING), WALL, dtype=np.uint8)
     cells[RING : RING + height, RING : RING + width] = code
-    tiles = cells.reshape(down, TILE, across, TILE).transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(tiles).reshape(-1), across
+    stacks = cells.reshape(down, STACK, -1).transpose(0, 2, 1)
+    return np.ascontiguousarray(stacks).view("<u4").reshape(-1)
 
 
 @njit(cache=True)
-def cell(words, first_tile, tiles_across, col, row):
+def cell(words, first_word, grid_width, col, row):
     """The byte of a cell; `col` and `row` count the ring and lie in the grid."""
-    tile = first_tile + (row >> 3) * tiles_across + (col >> 3)
-    word = words[(tile << 4) + ((row & 7) << 1) + ((col >> 2) & 1)]
-    return (np.int64(word) >> ((col & 3) << 3)) & 255
+    word = words[first_word + (row >> 2) * grid_width + col]
+    return (np.int64(word) >> ((row & 3) << 3)) & 255
 
 
 @njit(cache=True)

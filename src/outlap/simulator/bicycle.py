@@ -50,9 +50,7 @@ def kinematic(state, steer_rate, acceleration, p):
     tan_rate = steer_rate * (1.0 + tan_steer * tan_steer)  # d tan(steer) / dt
     slip_rate = tan_rate * p[LR] / wheelbase * cos_slip * cos_slip
     yaw_acceleration = (
-        acceleration * cos_slip * tan_steer
-        - speed * sin_slip * slip_rate * tan_steer
-        + speed * cos_slip * tan_rate
+        acceleration * cos_slip * tan_steer - speed * sin_slip * slip_rate * tan_steer + speed * cos_slip * tan_rate
     ) / wheelbase
     return (
         speed * (cos_yaw * cos_slip - sin_yaw * sin_slip),
@@ -163,9 +161,7 @@ def lateral_rate(front_stiffness, rear_stiffness, p):
     yaw_damping = ratio * (p[LF] * p[LF] * front_stiffness + p[LR] * p[LR] * rear_stiffness)
     coupling = p[LR] * rear_stiffness - p[LF] * front_stiffness
     return 0.5 * (
-        slip_damping
-        + yaw_damping
-        + math.sqrt((slip_damping - yaw_damping) ** 2 + 4.0 * ratio * coupling * coupling)
+        slip_damping + yaw_damping + math.sqrt((slip_damping - yaw_damping) ** 2 + 4.0 * ratio * coupling * coupling)
     )
 
 

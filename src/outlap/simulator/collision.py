@@ -8,13 +8,12 @@ from numba import njit
 
 from outlap.simulator.atlas import (
     COS,
-    FIRST_TILE,
+    FIRST_WORD,
     GRID_HEIGHT,
     GRID_WIDTH,
     QUARTER,
     RESOLUTION,
     SIN,
-    TILES_ACROSS,
     WALL,
     cell,
     to_grid,
@@ -40,7 +39,7 @@ def touches_wall(atlas, track, x, y, yaw, half_length, half_width):
     per_metre = 1.0 / atlas.frame[track, RESOLUTION]
     a = half_length * per_metre
     b = half_width * per_metre
-    clearance = cell(atlas.words, index[FIRST_TILE], index[TILES_ACROSS], int(col), int(row))
+    clearance = cell(atlas.words, index[FIRST_WORD], width, int(col), int(row))
     if clearance != WALL and clearance * QUARTER > math.sqrt(a * a + b * b):
         return False
 
@@ -64,7 +63,7 @@ def touches_wall(atlas, track, x, y, yaw, half_length, half_width):
             dx = i + 0.5 - col
             if abs(cos * dx + sin * dy) >= along or abs(cos * dy - sin * dx) >= across:
                 continue
-            if cell(atlas.words, index[FIRST_TILE], index[TILES_ACROSS], i, j) == WALL:
+            if cell(atlas.words, index[FIRST_WORD], width, i, j) == WALL:
                 return True
     return False
 

@@ -122,7 +122,7 @@ def _collide(atlas, worlds, w):
         dx = worlds.state[w, c, column.X] - worlds.before[w, c, 0]
         dy = worlds.state[w, c, column.Y] - worlds.before[w, c, 1]
         moved = math.sqrt(dx * dx + dy * dy)
-        checks = max(checks, int(math.ceil(moved / worlds.params[w, c, WIDTH])))
+        checks = max(checks, math.ceil(moved / worlds.params[w, c, WIDTH]))
     track = worlds.track[w]
     for check in range(1, checks + 1):
         share = check / checks
@@ -297,10 +297,10 @@ def _place(atlas, constants, worlds, w, c, start):
     # Unwrapped as given: of two cars, one before and one behind the line, the right one leads.
     worlds.distance[w, c] = start[0]
     from_line = start[0] - length * math.floor(start[0] / length + 0.5)
-    worlds.next_line[w, c] = int(math.floor(start[0] / length)) + 1
+    worlds.next_line[w, c] = math.floor(start[0] / length) + 1
     worlds.lap_start[w, c] = math.nan
     if abs(from_line) < 1e-3:  # on the line: the first lap is timed from here
-        worlds.next_line[w, c] = int(math.floor(start[0] / length + 0.5)) + 1
+        worlds.next_line[w, c] = math.floor(start[0] / length + 0.5) + 1
         worlds.lap_start[w, c] = 0.0
     worlds.laps[w, c] = 0
     worlds.lap_time[w, c] = math.nan

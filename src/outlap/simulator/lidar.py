@@ -1,9 +1,12 @@
 """A planar LiDAR: ray casting on walls and on other cars, then what is wrong with the ranges.
 
 Walls: from a cell whose clearance is c, a ray may go to the cell's edge and c further before it can meet a
-wall. So every step passes at least one cell and never a wall, and the range is exact to a thousandth of a cell
-(sphere tracing, Hart 1996, joined with the grid walk of Amanatides and Woo 1987). `LANES` neighbouring beams
-march in lock-step: that loop compiles to vector instructions.
+wall. So every step passes at least one cell and never a wall, and the range is exact to a few thousandths of a
+cell (sphere tracing, Hart 1996, joined with the grid walk of Amanatides and Woo 1987).
+
+Speed: `LANES` neighbouring beams march in lock-step, a loop that compiles to vector instructions. `SLOTS` such
+groups take turns, so that the processor can work on one while it waits for the memory of another; a group that
+has arrived makes room for the next.
 """
 
 from __future__ import annotations
@@ -17,11 +20,25 @@ from numba import carray, njit, types
 from numba.extending import intrinsic
 
 from outlap.seeding import hash64
-from outlap.simulator.atlas import FIRST_TILE, GRID_HEIGHT, GRID_WIDTH, QUARTER, RESOLUTION, TILES_ACROSS, to_grid
+from outlap.simulator.atlas import (
+    COS,
+    FIRST_WORD,
+    GRID_HEIGHT,
+    GRID_WIDTH,
+    QUARTER,
+    RESOLUTION,
+    SIN,
+    WALL,
+    cell,
+    to_grid,
+)
 from outlap.simulator.vehicle import BIAS, DROPOUT, MAX_RANGE, NOISE_STD
 
-LANES = 32
+LANES = 8
+SLOTS = 4
 OVERSTEP = np.float32(2e-3)  # [cells] past a cell's edge, so that rounding leaves no ray on it
+STEEPEST = np.float32(1e-5)  # least slope [rad] of a ray to the grid, so that crossings stay within float32
+FASTMATH = {"nnan", "ninf", "nsz", "contract"}
 _f4, _u4 = np.float32, np.uint32
 
 QUANTILES = 4096
@@ -48,14 +65,33 @@ def _lanes(typingctx):
 
     def codegen(context, builder, signature, arguments):
         with builder.goto_entry_block():
-            lanes = builder.alloca(ir.ArrayType(ir.FloatType(), LANES))
+            lanes = builder.alloca(ir.ArrayType(ir.FloatType(), LANES * SLOTS))
             lanes.align = 64
         return builder.bitcast(lanes, ir.FloatType().as_pointer())
 
     return types.CPointer(types.float32)(), codegen
 
 
-@njit(cache=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz", "contract"})
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+def _aim(lane, first, clear, x0, y0, cos, sin, beam_cos, beam_sin, t, dx, dy, inverse_dx, inverse_dy, edge_x, edge_y):
+    """Point the lanes of a slot, from `lane` on, along the beams from `first` on, if there are any left."""
+    if first + LANES > beam_cos.shape[0]:
+        return
+    for k in range(LANES):
+        t[lane + k] = clear
+        a = cos * beam_cos[first + k] - sin * beam_sin[first + k]
+        b = sin * beam_cos[first + k] + cos * beam_sin[first + k]
+        a = STEEPEST if abs(a) < STEEPEST else a
+        b = STEEPEST if abs(b) < STEEPEST else b
+        dx[lane + k] = a
+        dy[lane + k] = b
+        inverse_dx[lane + k] = _f4(1) / a
+        inverse_dy[lane + k] = _f4(1) / b
+        edge_x[lane + k] = ((_f4(1) if a > _f4(0) else _f4(0)) - x0) * inverse_dx[lane + k]
+        edge_y[lane + k] = ((_f4(1) if b > _f4(0) else _f4(0)) - y0) * inverse_dy[lane + k]
+
+
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 def cast_walls(atlas, track, x, y, yaw, beam_cos, beam_sin, max_range, ranges_out):
     """Range of every beam to the nearest wall, at most `max_range`.
 
@@ -66,70 +102,77 @@ def cast_walls(atlas, track, x, y, yaw, beam_cos, beam_sin, max_range, ranges_ou
         max_range: [m].
         ranges_out: (beams,) [m].
     """
-    t = carray(_lanes(), LANES)  # [cells] how far each ray has come
-    dx = carray(_lanes(), LANES)  # direction
-    dy = carray(_lanes(), LANES)
-    inverse_dx = carray(_lanes(), LANES)
-    inverse_dy = carray(_lanes(), LANES)
-    edge_x = carray(_lanes(), LANES)  # the edge of a cell that the ray leaves through: 0 or 1
-    edge_y = carray(_lanes(), LANES)
+    beam = carray(_lanes(), LANES * SLOTS)  # of each slot: its first beam; one that does not exist if idle
+    t = carray(_lanes(), LANES * SLOTS)  # [cells] how far each ray has come
+    dx = carray(_lanes(), LANES * SLOTS)  # direction
+    dy = carray(_lanes(), LANES * SLOTS)
+    inverse_dx = carray(_lanes(), LANES * SLOTS)
+    inverse_dy = carray(_lanes(), LANES * SLOTS)
+    edge_x = carray(_lanes(), LANES * SLOTS)  # column c is left at t = c / dx + edge_x
+    edge_y = carray(_lanes(), LANES * SLOTS)  # row r at t = r / dy + edge_y
 
-    first_tile = _u4(atlas.index[track, FIRST_TILE])
-    across = _u4(atlas.index[track, TILES_ACROSS])
+    width = atlas.index[track, GRID_WIDTH]
+    height = atlas.index[track, GRID_HEIGHT]
+    first_word = atlas.index[track, FIRST_WORD]
+    words = atlas.words[first_word : first_word + width * ((height + 3) >> 2)]
+    pitch = _u4(width)
     col, row = to_grid(atlas.frame, track, x, y)
-    x0 = _f4(min(max(col, 0.5), atlas.index[track, GRID_WIDTH] - 0.5))
-    y0 = _f4(min(max(row, 0.5), atlas.index[track, GRID_HEIGHT] - 0.5))
+    x0 = _f4(min(max(col, 0.5), width - 0.5))
+    y0 = _f4(min(max(row, 0.5), height - 0.5))
+    here = cell(atlas.words, first_word, width, int(x0), int(y0))
+    clear = _f4(0) if here == WALL else _f4(here) * _f4(QUARTER)  # every beam may begin with this
     resolution = _f4(atlas.frame[track, RESOLUTION])
-    farthest = _f4(max_range)
-    longest = farthest / resolution
-    yaw_in_grid = yaw - math.atan2(atlas.frame[track, 3], atlas.frame[track, 2])
+    yaw_in_grid = yaw - math.atan2(atlas.frame[track, SIN], atlas.frame[track, COS])
     cos = _f4(math.cos(yaw_in_grid))
     sin = _f4(math.sin(yaw_in_grid))
-    words = atlas.words
 
     beams = ranges_out.shape[0]
-    for first in range(0, beams, LANES):
-        for k in range(LANES):
-            a = cos * beam_cos[first + k] - sin * beam_sin[first + k]
-            b = sin * beam_cos[first + k] + cos * beam_sin[first + k]
-            a = _f4(1e-9) if abs(a) < _f4(1e-9) else a
-            b = _f4(1e-9) if abs(b) < _f4(1e-9) else b
-            t[k] = _f4(0)
-            dx[k] = a
-            dy[k] = b
-            inverse_dx[k] = _f4(1) / a
-            inverse_dy[k] = _f4(1) / b
-            edge_x[k] = _f4(1) if a > _f4(0) else _f4(0)
-            edge_y[k] = _f4(1) if b > _f4(0) else _f4(0)
-        while True:
+    waiting = 0  # the first beam that no slot has had
+    for slot in range(SLOTS):
+        beam[slot] = waiting
+        _aim(
+            slot * LANES, waiting, clear, x0, y0, cos, sin, beam_cos, beam_sin,
+            t, dx, dy, inverse_dx, inverse_dy, edge_x, edge_y,
+        )  # fmt: skip
+        waiting += LANES
+    idle = 0
+    while idle < SLOTS:
+        idle = 0
+        for slot in range(SLOTS):
+            lane = slot * LANES
+            first = int(beam[slot])
+            if first >= beams:
+                idle += 1
+                continue
             marching = _u4(0)
             for k in range(LANES):
                 # All integers are cast to 32 bits at every step: wider ones halve the lanes of a register.
-                px = x0 + t[k] * dx[k]
-                py = y0 + t[k] * dy[k]
-                i = np.int32(px)
-                j = np.int32(py)
-                u = _u4(i)
+                now = t[lane + k]
+                i = np.int32(x0 + now * dx[lane + k])
+                j = np.int32(y0 + now * dy[lane + k])
                 v = _u4(j)
-                tile = _u4(_u4(first_tile + _u4(_u4(v >> _u4(3)) * across)) + _u4(u >> _u4(3)))
-                within = _u4(_u4(_u4(v & _u4(7)) << _u4(1)) | _u4(_u4(u >> _u4(2)) & _u4(1)))
-                word = words[_u4(_u4(_u4(tile << _u4(4)) | within) & _u4(0x3FFFFFFF))]
-                code = _u4(_u4(word >> _u4(_u4(u & _u4(3)) << _u4(3))) & _u4(255))
-                to_x = (_f4(i) + edge_x[k] - px) * inverse_dx[k]
-                to_y = (_f4(j) + edge_y[k] - py) * inverse_dy[k]
-                to_edge = (to_x if to_x < to_y else to_y) + OVERSTEP
-                free = (code != _u4(255)) & (t[k] < longest)
-                step = to_edge + _f4(np.int32(code)) * _f4(QUARTER)
-                t[k] += step if free else _f4(0)
+                word = words[_u4(_u4(_u4(_u4(v >> _u4(2)) * pitch) + _u4(i)) & _u4(0x7FFFFFFF))]
+                code = _u4(_u4(word >> _u4(_u4(v & _u4(3)) << _u4(3))) & _u4(255))
+                out_x = _f4(i) * inverse_dx[lane + k] + edge_x[lane + k]
+                out_y = _f4(j) * inverse_dy[lane + k] + edge_y[lane + k]
+                out = out_x if out_x < out_y else out_y
+                out = out if out > now else now
+                free = code != _u4(255)
+                t[lane + k] = out + (_f4(np.int32(code)) * _f4(QUARTER) + OVERSTEP) if free else now
                 marching = _u4(marching + _u4(free))
             if marching == _u4(0):
-                break
-        for k in range(min(LANES, beams - first)):
-            reached = t[k] * resolution
-            ranges_out[first + k] = reached if reached < farthest else farthest
+                for k in range(min(LANES, beams - first)):
+                    reached = t[lane + k] * resolution
+                    ranges_out[first + k] = reached if reached < max_range else max_range
+                beam[slot] = waiting
+                _aim(
+                    lane, waiting, clear, x0, y0, cos, sin, beam_cos, beam_sin,
+                    t, dx, dy, inverse_dx, inverse_dy, edge_x, edge_y,
+                )  # fmt: skip
+                waiting += LANES
 
 
-@njit(cache=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz", "contract"})
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 def cast_car(x, y, yaw, beam_cos, beam_sin, other_x, other_y, other_yaw, half_length, half_width, ranges_io):
     """Shorten the ranges of beams that meet another car's rectangle first.
 

@@ -69,9 +69,7 @@ def tyre_forces(slip, slip_angle, load, p):
     # CommonRoad adds the vertical shift inside the sine, in newtons; for a 1:10 car it is 1e-4.
     stiffness_x = p[P_KX1] / (p[P_CX1] * peak_x)
     pure_x = (
-        peak_x
-        * load
-        * math.sin(_magic_angle(stiffness_x * (p[P_HX1] - slip), p[P_CX1], p[P_EX1]) + load * p[P_VX1])
+        peak_x * load * math.sin(_magic_angle(stiffness_x * (p[P_HX1] - slip), p[P_CX1], p[P_EX1]) + load * p[P_VX1])
     )
     stiffness_y = p[P_KY1] / (p[P_CY1] * friction)
     pure_y = friction * load * math.sin(_magic_angle(stiffness_y * slip_angle, p[P_CY1], p[P_EY1]))

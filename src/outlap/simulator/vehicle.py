@@ -134,7 +134,8 @@ class VehicleParams(Config):
     lr: Positive = 0.17145  # centre of gravity to rear axle [m]
     h: NonNegative = 0.074  # height of the centre of gravity [m]
     m: Positive = 3.74  # mass [kg]
-    I: Positive = 0.04712  # yaw inertia [kg m^2]  # noqa: E741
+    I: Positive = 0.04712  # noqa: E741
+    """yaw inertia [kg m^2]"""
     width: Positive = 0.31  # of the body [m]
     length: Positive = 0.58  # of the body [m]
     steer_min: RightAngle = -0.4189  # right stop [rad]

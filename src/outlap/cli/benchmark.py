@@ -1,0 +1,171 @@
+"""`outlap benchmark simulator`."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import platform
+import resource
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import FlagCreatePairsOff
+
+from outlap.cli.output import CommandResult
+from outlap.cli.progress import progress_bar
+from outlap.errors import OutlapError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+CASES = ((1, 108), (1, 540), (1, 1080), (2, 540))  # cars, beams
+HOLD = 10  # physics steps that a random command is held
+PLANS = 64  # random commands made beforehand
+
+
+@dataclass(frozen=True)
+class BenchmarkSimulator:
+    """Measure physics steps with their scans per second, every core at work.
+
+    Random driving: each car holds a steering angle within 0.2 rad and a speed within 8 m/s for 10 steps. A
+    world whose first car crashed is reset, and the time for that counts. An env-step is one physics step of a world.
+    """
+
+    worlds: int = 256
+    """Worlds in lock-step."""
+
+    cars: int | None = None
+    """Cars a world; with --beams one case in place of the usual four."""
+
+    beams: int | None = None
+    """LiDAR beams."""
+
+    tracks: tuple[str, ...] = ()
+    """Names or map folders; the built-in training circuits by default."""
+
+    model: Literal["kinematic", "single_track", "drift"] = "single_track"
+    """Vehicle model."""
+
+    integrator: Literal["euler", "rk4"] = "rk4"
+    """Integrator."""
+
+    seconds: float = 5.0
+    """How long each case is measured."""
+
+    repeats: int = 3
+    """Measurements of each case; the median is reported, with the fastest and the slowest."""
+
+    quiet: FlagCreatePairsOff[bool] = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        if (self.cars is None) != (self.beams is None):
+            raise OutlapError("--cars and --beams go together: give both for one case, or neither for the usual four")
+        if self.worlds < 1 or self.seconds <= 0 or self.repeats < 1:
+            raise OutlapError("--worlds and --repeats must be at least 1 and --seconds more than 0")
+        cases = CASES if self.cars is None or self.beams is None else ((self.cars, self.beams),)
+        rows = []
+        with progress_bar("benchmark", len(cases), "cases", self.quiet) as update:
+            for cars, beams in cases:
+                # A process of its own each, so that its peak of memory is its own.
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    rows.append(pool.apply(_measure, (self, cars, beams)))
+                update(len(rows), f"{cars} car(s), {beams} beams")
+        import numba
+
+        data = {
+            "rows": rows,
+            "model": self.model,
+            "integrator": self.integrator,
+            "timestep_s": 0.01,
+            "threads": numba.config.NUMBA_NUM_THREADS,
+            "cores": os.cpu_count(),
+            "machine": platform.platform(),
+        }
+        return CommandResult(data, lambda console: _print(console, rows))
+
+
+def _measure(settings: BenchmarkSimulator, cars: int, beams: int) -> dict[str, Any]:
+    import numpy as np
+
+    from outlap.envs.tasks import load_tracks
+    from outlap.simulator.collision import FREE
+    from outlap.simulator.simulator import Simulator, SimulatorConfig
+    from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+    from outlap.track.generate import BUILTIN_TRAIN
+
+    tracks = load_tracks(settings.tracks or BUILTIN_TRAIN)
+    worlds = settings.worlds
+    config = SimulatorConfig(beams=beams, model=settings.model, integrator=settings.integrator)
+    simulator = Simulator(tracks, worlds, cars, config)
+    rng = np.random.default_rng(0)
+    lengths = np.array([track.centerline.length for track in tracks])
+    row, _ = parameter_bounds(VehicleParams())
+    plans = np.stack(
+        [rng.uniform(-0.2, 0.2, (PLANS, worlds, cars)), rng.uniform(0.0, 8.0, (PLANS, worlds, cars))], axis=-1
+    ).astype(np.float32)
+
+    def reset(which: np.ndarray) -> None:
+        number = rng.integers(len(tracks), size=len(which))
+        starts = np.zeros((len(which), cars, 4))
+        starts[..., 0] = (rng.random(len(which)) * lengths[number])[:, None] - 2.0 * np.arange(cars)
+        starts[..., 3] = 3.0
+        simulator.reset(
+            which,
+            keys=rng.integers(2**63, size=len(which), dtype=np.uint64),
+            tracks=number,
+            params=np.broadcast_to(row, (len(which), cars, len(row))),
+            starts=starts,
+        )
+
+    def drive(steps: int) -> None:
+        for step in range(steps):
+            simulator.step(plans[step // HOLD % PLANS])
+            crashed = np.flatnonzero(simulator.worlds.contact[:, 0] != FREE)
+            if len(crashed):
+                reset(crashed)
+
+    reset(np.arange(worlds))
+    drive(2 * HOLD)
+    rates = []
+    for _ in range(settings.repeats):
+        steps, begin = 0, time.perf_counter()
+        while time.perf_counter() - begin < settings.seconds:
+            drive(HOLD)
+            steps += HOLD
+        rates.append(steps * worlds / (time.perf_counter() - begin))
+    return {
+        "cars": cars,
+        "beams": beams,
+        "worlds": worlds,
+        "tracks": len(tracks),
+        "env_steps_per_second": round(float(np.median(rates))),
+        "slowest_env_steps_per_second": round(min(rates)),
+        "fastest_env_steps_per_second": round(max(rates)),
+        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "compile_s": round(simulator.compile_seconds or 0.0, 2),
+    }
+
+
+def _print(console: Console, rows: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    table = Table(title="simulator: physics steps with scans")
+    for heading in ("cars", "beams", "worlds", "env-steps/s", "slowest … fastest", "peak memory [MB]", "compile [s]"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(
+            str(row["cars"]),
+            str(row["beams"]),
+            str(row["worlds"]),
+            f"{row['env_steps_per_second']:,}",
+            f"{row['slowest_env_steps_per_second']:,} … {row['fastest_env_steps_per_second']:,}",
+            f"{row['peak_memory_mb']:,.0f}",
+            f"{row['compile_s']:.1f}",
+        )
+    console.print(table)
+    console.print("compile: what the kernels' first call took; the result is cached on disk", style="dim")

@@ -1,0 +1,332 @@
+"""`outlap evaluate`."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from outlap.cli.output import CommandResult
+from outlap.errors import OutlapError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from outlap.drivers.driver import Driver
+    from outlap.envs.race_config import RaceConfig
+    from outlap.evaluation.rollout import EvaluationProgress
+    from outlap.track import Track
+    from outlap.training.run import Run
+
+Flag = FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Race a driver on tracks, from a standstill anywhere on the lap, and measure it.
+
+    The episodes are settled in advance by --seed, the same ones for every driver. The car is that of the
+    training, with its ranges. The paper's protocol: --laps 0 --time-limit 5 --episodes 500.
+    """
+
+    driver: Annotated[Positional[str], arg(metavar="RUN")]
+    """A run folder of `outlap train`, or a driver without one: centerline-follower."""
+
+    tracks: tuple[str, ...] = ()
+    """Names or map folders; by default the run's held-out tracks, or else the built-in held-out ones."""
+
+    episodes: int = 100
+    """On each track."""
+
+    laps: int = 3
+    """Completed laps that end an episode, counted from line to line; 0: none do."""
+
+    time_limit: float | None = None
+    """[s] of an episode; by default enough for one lap more than --laps at 1 m/s."""
+
+    v_max: float | None = None
+    """[m/s] top speed of the cars, in place of the run's."""
+
+    seed: int = 0
+    """Of the episodes."""
+
+    worlds: int = 128
+    """Episodes raced at once; changes the speed, and not the results."""
+
+    stochastic: Flag = False
+    """Draw actions from the policy's distribution, as in training; then results depend on --worlds too."""
+
+    out: Path | None = None
+    """A new or empty folder for the results; by default RUN/evaluations/TIME."""
+
+    quiet: Flag = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        self._check_flags()
+        # Numba's threads and torch's take turns: those that wait must not keep a core busy.
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        from outlap.envs.tasks import load_tracks
+        from outlap.evaluation.rollout import standing_starts
+
+        run, trained_env = self._subject()
+        tracks = load_tracks(self.tracks or _held_out(run))
+        env = standing_starts(_with_top_speed(trained_env, self.v_max), tracks, self.laps, self.time_limit)
+        driver = self._driver(run)
+        home = run.folder if run else Path("runs") / driver.name
+        folder = self.out or _unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
+        return evaluate_into(
+            folder,
+            driver,
+            env,
+            tracks,
+            episodes=self.episodes,
+            seed=self.seed,
+            num_worlds=self.worlds,
+            run=run,
+            facts={"stochastic": self.stochastic},
+            quiet=self.quiet,
+        )
+
+    def _check_flags(self) -> None:
+        for flag, value, least in (
+            ("--episodes", self.episodes, 1),
+            ("--laps", self.laps, 0),
+            ("--seed", self.seed, 0),
+            ("--worlds", self.worlds, 1),
+        ):
+            if value < least:
+                raise OutlapError(f"{flag} is {value}; must be {least} or more")
+        for flag, number in (("--time-limit", self.time_limit), ("--v-max", self.v_max)):
+            if number is not None and not 0.0 < number < float("inf"):
+                raise OutlapError(f"{flag} is {number}; must be > 0")
+        if self.laps == 0 and self.time_limit is None:
+            raise OutlapError("--laps is 0; must be 1 or more, or be given with a --time-limit")
+
+    def _subject(self) -> tuple[Run | None, RaceConfig]:
+        """The run, if there is one, and the environment that the driver is made for."""
+        from outlap.training.ppo import PPOConfig
+        from outlap.training.run import load_run
+
+        if Path(self.driver).exists():
+            run = load_run(self.driver)
+            return run, run.config.env
+        if self.driver not in _drivers():
+            raise OutlapError(
+                f"{self.driver}: no such run folder; make one with outlap train ppo, or name a driver: "
+                f"{', '.join(_drivers())}"
+            )
+        return None, PPOConfig().env
+
+    def _driver(self, run: Run | None) -> Driver:
+        if run is None:
+            if self.stochastic:
+                raise OutlapError(f"--stochastic is for a trained policy; {self.driver} draws nothing")
+            return _drivers()[self.driver]()
+        from outlap.drivers.policy import PolicyDriver
+
+        return PolicyDriver.load(
+            run.policy_path,
+            scale_observations=run.config.env.scale_observations,
+            deterministic=not self.stochastic,
+            seed=self.seed,
+            name=run.folder.resolve().name,
+        )
+
+
+def evaluate_into(
+    folder: Path,
+    driver: Driver,
+    env: RaceConfig,
+    tracks: Sequence[Track],
+    *,
+    episodes: int,
+    seed: int,
+    num_worlds: int,
+    run: Run | None = None,
+    facts: Mapping[str, Any] | None = None,
+    quiet: bool = False,
+) -> CommandResult:
+    """Evaluate with a progress bar and leave rows, summary and record in a folder.
+
+    Args:
+        folder: new or empty; removed again if the evaluation does not come to its end.
+        driver: to evaluate.
+        env: the task, see `rollout.standing_starts`.
+        tracks: to evaluate on.
+        episodes: on each track.
+        seed, num_worlds: see `rollout.evaluate`.
+        run: of the driver, if it has one: tracks that it was trained on are named as such.
+        facts: more for the record.
+        quiet: show no progress.
+
+    Raises OutlapError for a folder that is not empty or cannot be written, and what `evaluate` raises.
+    """
+    from outlap.cli.progress import progress_bar
+    from outlap.evaluation.metrics import summarise
+    from outlap.evaluation.results import prepare_folder, save_results
+    from outlap.evaluation.rollout import evaluate
+    from outlap.training.run import provenance
+
+    prepare_folder(folder)
+    begun = time.monotonic()
+    try:
+        with progress_bar("evaluating", episodes * len(tracks), "episodes", quiet) as update:
+
+            def show(progress: EvaluationProgress) -> None:
+                rate = progress.steps / max(time.monotonic() - begun, 1e-9)
+                update(int(progress.done), f"{progress.finished} finished  {rate:,.0f} steps/s")
+
+            rows = evaluate(driver, env, tracks, episodes, seed, num_worlds, show)
+    except BaseException:
+        with suppress(OSError):
+            folder.rmdir()  # it is empty
+        raise
+    names = [track.name for track in tracks]
+    trained_on = _trained_on(run, names)
+    summary = {**summarise(rows), "trained_on": trained_on}
+    record = {
+        **provenance(),
+        "seconds": round(time.monotonic() - begun, 1),
+        "driver": driver.name,
+        **_policy_record(run),
+        "tracks": names,
+        "trained_on": trained_on,
+        "episodes_per_track": episodes,
+        "seed": seed,
+        "worlds": num_worlds,
+        **(facts or {}),
+        "env": env.model_dump(mode="json"),
+    }
+    save_results(folder, rows, summary, record)
+    data = {**summary, "driver": driver.name, "folder": folder}
+    return CommandResult(data, lambda console: show_summary(console, data))
+
+
+def show_summary(console: Console, data: Mapping[str, Any]) -> None:
+    """Print what an evaluation found, and where it is."""
+    trained_on = data["trained_on"]
+    console.print(_table(data, f"{data['driver']}: driving", DRIVING))
+    console.print(_table(data, f"{data['driver']}: the paper's measures", PAPER))
+    console.print(
+        "mean ± standard deviation over episodes, [95 % interval of the mean]; lap time: of episodes with a lap",
+        style="dim", highlight=False, markup=False,
+    )  # fmt: skip
+    if trained_on:
+        console.print(
+            f"* trained on {', '.join(trained_on)}: not a result on unseen tracks", highlight=False, markup=False
+        )
+    console.print(f"results: {data['folder']}", highlight=False, markup=False, soft_wrap=True)
+
+
+DRIVING = ("episodes", "crash_rate", "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m")
+PAPER = ("crashes", "overtakes", "places_lost", "episode_steps", "episode_return")
+HEADINGS = {
+    "episodes": "episodes",
+    "crash_rate": "crash rate",
+    "completed_laps": "laps",
+    "lap_time_s": "lap time [s]",
+    "mean_speed_mps": "speed [m/s]",
+    "progress_m": "progress [m]",
+    "crashes": "crashes",
+    "overtakes": "overtakes",
+    "places_lost": "places lost",
+    "episode_steps": "steps",
+    "episode_return": "return",
+}
+
+
+def _table(data: Mapping[str, Any], title: str, columns: Sequence[str]) -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("track", overflow="fold")
+    for column in columns:
+        table.add_column(HEADINGS[column], justify="right", no_wrap=True)
+    for name, summary in data["tracks"].items():
+        mark = " *" if name in data["trained_on"] else ""
+        table.add_row(Text(name + mark), *(_cell(summary, column) for column in columns))
+    if len(data["tracks"]) > 1:
+        table.add_section()
+        table.add_row("all", *(_cell(data["all"], column) for column in columns))
+    return table
+
+
+def _cell(summary: Mapping[str, Any], column: str) -> str:
+    if column == "crashes":
+        return str(summary["outcomes"]["crash"])
+    if column == "crash_rate":
+        low, high = (100.0 * summary[f"crash_rate_{end}"] for end in ("low", "high"))
+        return f"{100.0 * summary['crash_rate']:.1f} %\n[{low:.1f}, {high:.1f}]"
+    value = summary[column]
+    if not isinstance(value, Mapping):
+        return str(value)
+    if value["mean"] is None:
+        return "-"
+    digits = 0 if column in ("progress_m", "episode_steps") else 2
+    if value["sd"] is None:
+        return f"{value['mean']:.{digits}f}"
+    return (
+        f"{value['mean']:.{digits}f} ± {value['sd']:.{digits}f}\n"
+        f"[{value['low']:.{digits}f}, {value['high']:.{digits}f}]"
+    )
+
+
+def _drivers() -> dict[str, Any]:
+    """Classes of the drivers that need no run, by name."""
+    from outlap.drivers.centerline_follower import CenterlineFollower
+
+    return {CenterlineFollower.name: CenterlineFollower}
+
+
+def _held_out(run: Run | None) -> tuple[str, ...]:
+    from outlap.track.generate import BUILTIN_HELD_OUT
+
+    return (run.config.held_out_tracks if run else ()) or BUILTIN_HELD_OUT
+
+
+def _with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
+    if v_max is None:
+        return env
+    return env.model_copy(update={"vehicle": env.vehicle.model_copy(update={"v_max": v_max})})
+
+
+def _trained_on(run: Run | None, tracks: Sequence[str]) -> list[str]:
+    """Those of the tracks that the run was trained on."""
+    from outlap.track.catalog import name_key
+    from outlap.track.generate import BUILTIN_TRAIN
+
+    if run is None:
+        return []
+    trained = {name_key(Path(name).name) for name in run.config.env.tracks or BUILTIN_TRAIN}
+    return [name for name in tracks if name_key(name) in trained]
+
+
+def _policy_record(run: Run | None) -> dict[str, Any]:
+    if run is None:
+        return {}
+    path = run.policy_path
+    return {
+        "run": run.folder.resolve(),
+        "policy": path.relative_to(run.folder),
+        "policy_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+    }
+
+
+def _unused(folder: Path) -> Path:
+    """This folder, or one numbered like it where two evaluations begin in the same second."""
+    numbered = (folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))
+    return next(path for path in (folder, *numbered) if not path.exists())

@@ -1,0 +1,161 @@
+"""A Stable-Baselines3 policy as a driver."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import gymnasium as gym
+import numpy as np
+
+from outlap.errors import OutlapError
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+# Observations that a network sees at once. A matrix product rounds differently with the number of its rows;
+# this many always, padded where there are fewer, make a car's action independent of the cars beside it.
+BATCH = 64
+
+
+class PolicyDriver:
+    """Drives with the policy of a Stable-Baselines3 model, by default without its exploration noise.
+
+    Actions do not depend on how many cars are asked about together, unless the policy is stochastic.
+    """
+
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        *,
+        scale_observations: bool,
+        deterministic: bool = True,
+        seed: int = 0,
+        name: str = "policy",
+    ) -> None:
+        """Wrap a model.
+
+        Args:
+            model: whose observation is a Dict of observation terms.
+            scale_observations: whether it was trained on terms divided by their scale.
+            deterministic: take the most likely action; otherwise draw from the policy's distribution.
+            seed: of those draws.
+            name: in results.
+
+        Raises OutlapError for a model whose observations or actions are not those of outlap.
+        """
+        space = model.observation_space
+        if not isinstance(space, gym.spaces.Dict):
+            raise OutlapError(f"{name}: takes a {type(space).__name__} observation; must take a Dict of terms")
+        if model.action_space.shape != (2,):
+            raise OutlapError(f"{name}: gives actions of shape {model.action_space.shape}; must be (2,)")
+        self.name = name
+        self.observation_terms = tuple(space.spaces)
+        self.scale_observations = scale_observations
+        self._space = space
+        self._policy = model.policy
+        self._policy.set_training_mode(False)
+        self._deterministic = deterministic
+        self._random = None if deterministic else _random_state(seed)
+        self._padded = {
+            term: np.zeros((BATCH, *box.shape), np.float32)  # type: ignore[misc]
+            for term, box in space.spaces.items()
+        }
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        scale_observations: bool,
+        deterministic: bool = True,
+        seed: int = 0,
+        name: str = "policy",
+    ) -> PolicyDriver:
+        """A PPO model from the file that Stable-Baselines3 wrote, on the CPU.
+
+        Such a file can run code when it is loaded: load those of people you trust.
+
+        Raises OutlapError for a file that is missing, broken or of another algorithm.
+        """
+        from stable_baselines3 import PPO
+
+        if not Path(path).is_file():
+            raise OutlapError(f"{path}: no such file; must be a policy that outlap train wrote")
+        try:
+            model = PPO.load(Path(path), device="cpu")
+        except Exception as error:  # whatever a broken archive or pickle raises
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise OutlapError(f"{path}: cannot be loaded as a PPO model: {reason}") from error
+        return cls(
+            model,
+            scale_observations=scale_observations,
+            deterministic=deterministic,
+            seed=seed,
+            name=name,
+        )
+
+    def check(self, space: gym.Space) -> None:
+        """Compare what the policy was trained to see with what it would be shown.
+
+        Raises OutlapError that names the first term that differs, and how.
+        """
+        offered = space.spaces if isinstance(space, gym.spaces.Dict) else {}
+        for term, trained in self._space.spaces.items():
+            shown = offered.get(term)
+            if shown is None:
+                raise OutlapError(f"{self.name}: needs the observation {term!r}; there are {', '.join(offered)}")
+            if shown.shape != trained.shape:
+                raise OutlapError(
+                    f"{self.name}: was trained on {_size(trained)} numbers of {term!r} and would be shown "
+                    f"{_size(shown)}; evaluate it with the environment that it was trained on"
+                )
+            assert isinstance(shown, gym.spaces.Box)
+            assert isinstance(trained, gym.spaces.Box)
+            for end in ("low", "high"):
+                was, now = getattr(trained, end), getattr(shown, end)
+                if not np.allclose(was, now):
+                    at = int(np.flatnonzero(~np.isclose(was, now))[0])
+                    raise OutlapError(
+                        f"{self.name}: was trained on {term!r} with {end} = {was[at]:g} and would be shown one with "
+                        f"{now[at]:g}; evaluate it with the same scaling and range"
+                    )
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """See `Driver.act`; raises OutlapError for an observation that the policy was not trained on."""
+        count = len(observation[next(iter(observation))]) if observation else 0
+        for term, box in self._space.spaces.items():
+            shape, needed = np.shape(observation.get(term)), (count, *(box.shape or ()))
+            if shape != needed:
+                found = f"has shape {shape}" if term in observation else "is missing"
+                raise OutlapError(f"{self.name}: observation {term!r} {found}; must have shape {needed}")
+        if self._random is None:
+            return self._act(observation, count)
+        import torch
+
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._random)
+            actions = self._act(observation, count)
+            self._random = torch.get_rng_state()
+        return actions
+
+    def _act(self, observation: dict[str, np.ndarray], count: int) -> np.ndarray:
+        actions = np.empty((count, 2), np.float32)
+        for first in range(0, count, BATCH):
+            rows = min(BATCH, count - first)
+            for term, padded in self._padded.items():
+                padded[:rows] = observation[term][first : first + rows]
+            chosen, _ = self._policy.predict(self._padded, deterministic=self._deterministic)  # type: ignore[arg-type]
+            actions[first : first + rows] = chosen[:rows]
+        return actions
+
+
+def _random_state(seed: int):
+    import torch
+
+    return torch.Generator().manual_seed(seed).get_state()
+
+
+def _size(space: gym.Space) -> int:
+    return int(np.prod(space.shape or ()))

@@ -1,0 +1,48 @@
+"""The folder that an evaluation leaves behind."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from outlap.errors import OutlapError
+from outlap.files import atomic_write
+
+ROWS, SUMMARY, RECORD = "episodes.parquet", "summary.json", "evaluation.json"
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the folder now, so that a long evaluation does not end in a failed write.
+
+    Raises OutlapError where there is something in it already, or nothing can be written.
+    """
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise OutlapError(f"{folder}: is there already; must be an empty or a new folder")
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutlapError(f"{folder}: cannot be made: {error.strerror}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutlapError(f"{folder}: cannot be written to; give another folder")
+
+
+def save_results(folder: Path, rows: pd.DataFrame, summary: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+    """Write an evaluation into its folder; a kill leaves no half of a file.
+
+    Args:
+        folder: made by `prepare_folder`.
+        rows: of `evaluate`, as Parquet; `pandas.read_parquet` reads them back.
+        summary: of `summarise`, as JSON.
+        record: what is needed to repeat it, as JSON.
+    """
+    buffer = io.BytesIO()
+    rows.to_parquet(buffer, index=False)
+    atomic_write(folder / ROWS, buffer.getvalue())
+    for name, content in ((SUMMARY, summary), (RECORD, record)):
+        atomic_write(folder / name, json.dumps(content, indent=2, default=str) + "\n")

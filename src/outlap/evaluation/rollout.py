@@ -1,0 +1,252 @@
+"""Racing a driver in a fixed set of episodes: from a driver and tracks to rows, one an episode.
+
+Which episodes are raced is settled before the first step: so many on each track, each with its own seed, and
+each is raced to its end. How many worlds race at once changes nothing but the time that it takes. To stop at
+a number of steps, or to take the first N episodes that end, would favour short ones, which are crashes.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from gymnasium.vector import AutoresetMode
+
+from outlap.config import Config, bounds
+from outlap.drivers.driver import Driver
+from outlap.drivers.policy import PolicyDriver
+from outlap.envs.race import EGO
+from outlap.envs.race_config import RaceConfig, StartConfig
+from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.tasks import load_tracks
+from outlap.envs.terminations import CRASH, TerminationConfig
+from outlap.errors import OutlapError
+from outlap.track.track import Track
+
+DEFAULT_WORLDS = 128
+CRAWL = 1.0  # [m/s] mean speed at which the default time limit still allows all laps and the way to the line
+CURRICULA_OVER = 10**12  # training steps: returns are those at the end of every reward curriculum
+IDLE = -1  # the episode of a world that has none left
+
+
+@dataclass(frozen=True)
+class EvaluationProgress:
+    """How far an evaluation has come."""
+
+    total: int  # episodes
+    finished: int
+    done: float  # episodes, a running one counted by the share of its laps or time that is behind it
+    steps: int  # actions taken
+
+
+def standing_starts(
+    env: RaceConfig, tracks: Sequence[Track], laps: int = 3, time_limit: float | None = None
+) -> RaceConfig:
+    """A task as it is evaluated: from a standstill anywhere on the lap, until the laps are done.
+
+    Cars, sensors, actions and rewards stay those of `env`; where cars are put and how an episode ends do not,
+    so that policies are compared on the same episodes however they were trained.
+
+    Args:
+        env: what the policy was trained on.
+        tracks: to evaluate on.
+        laps: to complete from line to line; 0 for no end but the time limit.
+        time_limit: [s]; by default enough for `laps` + 1 laps of the longest track at 1 m/s.
+
+    Raises OutlapError for neither laps nor a time limit.
+    """
+    if time_limit is None:
+        if laps == 0:
+            raise OutlapError("laps is 0; a time limit is needed then")
+        time_limit = (laps + 1) * max(track.centerline.length for track in tracks) / CRAWL
+    changes = {
+        "tracks": tuple(track.name for track in tracks),
+        "start": StartConfig(anywhere=True, speed=0.0, gap=env.start.gap),
+        "termination": TerminationConfig(laps=laps, time_limit=time_limit),
+    }
+    return env.model_copy(update=changes)
+
+
+def episode_seeds(seed: int, track: str, episodes: int) -> np.ndarray:
+    """The seeds of a track's episodes: int64 (episodes,), the first ones the same however many there are."""
+    key = zlib.crc32(track.encode())
+    words = [np.random.SeedSequence((seed, key, k)).generate_state(1)[0] for k in range(episodes)]
+    return np.array(words, np.int64)
+
+
+def evaluate(
+    driver: Driver,
+    env_config: RaceConfig,
+    tracks: Sequence[str | Track],
+    episodes: int,
+    seed: int,
+    num_worlds: int = DEFAULT_WORLDS,
+    on_progress: Callable[[EvaluationProgress], None] | None = None,
+) -> pd.DataFrame:
+    """Race `driver` in `episodes` episodes on each track.
+
+    Nothing is learnt, and reward curricula are taken at their end. An episode can be raced again with
+    `RaceEnv(tracks=[track], ...).reset(seed=...)` and its row's seed.
+
+    Args:
+        driver: of the first car.
+        env_config: the task; its tracks are not used, its observation and scaling are replaced by the driver's.
+        tracks: names, map folders or tracks.
+        episodes: on each track.
+        seed: from which that of each episode is made; equal seeds give the same episodes to every driver.
+        num_worlds: raced at once; changes the time, and not the rows (those of a stochastic policy excepted).
+        on_progress: called after every step.
+
+    Returns:
+        A row an episode, in the order of the tracks and of their seeds: track, episode (its number), seed,
+        driver, outcome, terminated, truncated, episode_steps, duration_s, episode_return, last_reward,
+        overtakes, places_lost, completed_laps, lap_time_s (mean of its laps, NaN without one), start_m (arc
+        length), progress_m, mean_speed_mps, impact_speed_mps (NaN without a crash), and one column for each of
+        the ego's parameters that is drawn, such as vehicle_mu.
+
+    Raises OutlapError for tracks that cannot be loaded or share a name, an observation that the driver does
+    not take, episodes that may never end.
+    """
+    loaded = load_tracks(tracks)
+    _check_arguments(env_config, loaded, episodes, seed, num_worlds)
+    seeds = {track.name: episode_seeds(seed, track.name, episodes) for track in loaded}
+    total = episodes * len(loaded)
+    rows: list[dict[str, Any]] = []
+    steps = 0
+
+    def watch(finished: int, done: float, track_steps: int) -> None:
+        if on_progress is not None:
+            before = len(rows)
+            on_progress(EvaluationProgress(total, before + finished, before + done, steps + track_steps))
+
+    for track in loaded:
+        found, track_steps = _race(driver, env_config, track, seeds[track.name], num_worlds, watch)
+        rows += found
+        steps += track_steps
+    return pd.DataFrame(rows)
+
+
+def _check_arguments(config: RaceConfig, tracks: Sequence[Track], episodes: int, seed: int, num_worlds: int) -> None:
+    if not tracks:
+        raise OutlapError("tracks: none given; at least one is needed")
+    names = [track.name for track in tracks]
+    for name in names:
+        if names.count(name) > 1:
+            raise OutlapError(f"tracks: {name} is named twice; results are told apart by the track's name")
+    for field, value, least in (("episodes", episodes, 1), ("num_worlds", num_worlds, 1), ("seed", seed, 0)):
+        if value < least:
+            raise OutlapError(f"{field} is {value}; it must be at least {least}")
+    rules = config.termination
+    if not rules.time_limit and not (rules.laps and rules.stall_time):
+        raise OutlapError("termination: an episode may never end; set a time_limit, or laps and a stall_time")
+
+
+def _race(
+    driver: Driver,
+    config: RaceConfig,
+    track: Track,
+    seeds: np.ndarray,
+    num_worlds: int,
+    watch: Callable[[int, float, int], None],
+) -> tuple[list[dict[str, Any]], int]:
+    """Every episode of one track: its rows, and the steps that they took."""
+    worlds = min(num_worlds, len(seeds))
+    env = RaceVectorEnv(worlds, **_settings(driver, config, track), autoreset_mode=AutoresetMode.DISABLED)
+    if isinstance(driver, PolicyDriver):
+        driver.check(env.single_observation_space)
+    drawn = drawn_parameters(config)
+    rows: dict[int, dict[str, Any]] = {}
+    racing = np.arange(worlds)  # the episode of each world
+    upcoming = worlds
+    observation, _ = env.reset(seed=seeds[:worlds].tolist())
+    start = env.race.start.copy()
+    steps = 0
+    while len(rows) < len(seeds):
+        env.training_steps = CURRICULA_OVER
+        observation, rewards, terminated, truncated, info = env.step(driver.act(observation))
+        steps += int((racing != IDLE).sum())
+        over = terminated | truncated
+        for world in np.flatnonzero(over & (racing != IDLE)).tolist():
+            episode = int(racing[world])
+            rows[episode] = {
+                "track": track.name,
+                "episode": episode,
+                "seed": int(seeds[episode]),
+                "driver": driver.name,
+                **_row(info, world),
+                "terminated": bool(terminated[world]),
+                "truncated": bool(truncated[world]),
+                "last_reward": float(rewards[world]),
+                "start_m": float(start[world] % track.centerline.length),
+                **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
+            }
+        if over.any():
+            again: list[int | None] = [None] * worlds  # an idle world goes on with a stream of its own
+            for world in np.flatnonzero(over):
+                racing[world] = upcoming if upcoming < len(seeds) else IDLE
+                if racing[world] != IDLE:
+                    again[world] = int(seeds[upcoming])
+                    upcoming += 1
+            observation, info = env.reset(seed=again, options={"reset_mask": over})
+            start[over] = env.race.start[over]
+        watch(len(rows), len(rows) + _underway(config, track, info, racing != IDLE), steps)
+    return [rows[episode] for episode in range(len(seeds))], steps
+
+
+def _settings(driver: Driver, config: RaceConfig, track: Track) -> dict[str, Any]:
+    """Keywords of the environment that this driver needs."""
+    settings = dict(config)
+    settings["tracks"] = [track]
+    settings["observation"] = driver.observation_terms
+    settings["scale_observations"] = driver.scale_observations
+    if "scan" not in driver.observation_terms:
+        settings["beams"] = 0  # nobody looks
+    return settings
+
+
+def _row(info: dict[str, Any], world: int) -> dict[str, Any]:
+    """What the environment says of an episode that just ended."""
+    crashed = info["outcome"][world] == CRASH
+    return {
+        "outcome": str(info["outcome"][world]),
+        "episode_steps": int(info["episode_steps"][world]),
+        "duration_s": float(info["time_s"][world]),
+        "episode_return": float(info["episode_return"][world]),
+        "overtakes": int(info["overtakes"][world]),
+        "places_lost": int(info["places_lost"][world]),
+        "completed_laps": int(info["completed_laps"][world]),
+        "lap_time_s": float(info["lap_time_s"][world]),
+        "progress_m": float(info["progress_m"][world]),
+        "mean_speed_mps": float(info["mean_speed_mps"][world]),
+        "impact_speed_mps": float(info["impact_speed_mps"][world]) if crashed else float("nan"),
+    }
+
+
+def _underway(config: RaceConfig, track: Track, info: dict[str, Any], racing: np.ndarray) -> float:
+    """How many episodes' worth of racing the running ones have behind them, roughly."""
+    rules = config.termination
+    share = np.zeros(len(racing))
+    if rules.time_limit:
+        share = info["time_s"] / rules.time_limit
+    if rules.laps:
+        share = np.maximum(share, info["progress_m"] / (rules.laps * track.centerline.length))
+    return float(np.clip(share[racing], 0.0, 1.0).sum())
+
+
+def drawn_parameters(config: RaceConfig) -> dict[str, int]:
+    """Those of a car's parameters that are ranges: the name of each in a row, and its `vehicle` column."""
+    vehicle, names, ranges = config.vehicle, [], []
+    parts = (
+        ("vehicle", vehicle), ("vehicle_tyre", vehicle.tyre), ("actuators", config.actuators), ("lidar", config.lidar),
+    )  # fmt: skip
+    for prefix, part in parts:  # in the order of `vehicle.parameter_bounds`
+        for name in type(part).model_fields:
+            value = getattr(part, name)
+            if not isinstance(value, Config):
+                names.append(f"{prefix}_{name}")
+                ranges.append(bounds(value))
+    return {names[i]: i for i, (low, high) in enumerate(ranges) if low < high}

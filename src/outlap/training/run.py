@@ -1,0 +1,120 @@
+"""A run folder: everything that is needed to repeat, resume and use a training.
+
+config.yaml      the configuration
+run.json         command, seed, versions, machine, how far it came
+checkpoints/     step_N.zip, the newest few
+policy.zip       the finished policy
+tensorboard/
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import sys
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from outlap.config import load_config, save_config
+from outlap.errors import OutlapError
+from outlap.files import atomic_write
+
+if TYPE_CHECKING:
+    from outlap.training.ppo import PPOConfig
+
+CHECKPOINTS_KEPT = 3
+PACKAGES = ("outlap", "numpy", "numba", "torch", "stable-baselines3", "gymnasium")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder that exists."""
+
+    folder: Path
+    config: PPOConfig
+
+    @property
+    def policy_path(self) -> Path:
+        """The finished policy, or else the newest checkpoint. Raises OutlapError where there is neither."""
+        for path in (self.folder / "policy.zip", *self.checkpoints()):
+            if zipfile.is_zipfile(path):
+                return path
+        raise OutlapError(f"{self.folder}: holds no policy yet; train it with: outlap train ppo --resume {self.folder}")
+
+    def checkpoints(self) -> list[Path]:
+        """Checkpoints, newest first."""
+        found = (self.folder / "checkpoints").glob("step_*.zip")
+        return sorted((p for p in found if re.fullmatch(r"step_\d+", p.stem)), key=_steps_of, reverse=True)
+
+    def write_record(self, **facts: Any) -> None:
+        """Add facts to run.json."""
+        path = self.folder / "run.json"
+        record = json.loads(path.read_text()) if path.exists() else {}
+        atomic_write(path, json.dumps({**record, **facts}, indent=2, default=str) + "\n")
+
+
+def create_run(folder: Path, config: PPOConfig) -> Run:
+    """Make a run folder. Raises OutlapError if there is one already, or it cannot be written."""
+    if (folder / "config.yaml").exists():
+        raise OutlapError(f"{folder}: holds a run already; resume it with --resume {folder}, or give another --out")
+    try:
+        (folder / "checkpoints").mkdir(parents=True, exist_ok=True)
+        save_config(config, folder / "config.yaml")
+    except OSError as error:
+        raise OutlapError(f"{folder}: cannot be written: {error.strerror}; give another --out") from None
+    run = Run(folder, config)
+    run.write_record(**provenance(), seed=config.seed, finished=False)
+    return run
+
+
+def load_run(folder: str | os.PathLike[str]) -> Run:
+    """A run folder made by `outlap train`. Raises OutlapError where it is missing or broken."""
+    from outlap.training.ppo import PPOConfig
+
+    folder = Path(folder)
+    if not (folder / "config.yaml").is_file():
+        raise OutlapError(f"{folder}: is not a run folder, it has no config.yaml; make one with outlap train ppo")
+    return Run(folder, load_config(PPOConfig, folder / "config.yaml"))
+
+
+def save_checkpoint(run: Run, model: Any, name: str) -> Path:
+    """Write a Stable-Baselines3 model beside its place and rename it there; drop the oldest checkpoints."""
+    path = run.folder / name
+    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.zip")
+    try:
+        model.save(partial)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    for old in run.checkpoints()[CHECKPOINTS_KEPT:]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def provenance() -> Mapping[str, Any]:
+    """Where results come from: command, time, versions, machine."""
+    return {
+        "command": " ".join(["outlap", *sys.argv[1:]]),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
+        "machine": {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()},
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _steps_of(checkpoint: Path) -> int:
+    return int(checkpoint.stem.removeprefix("step_"))

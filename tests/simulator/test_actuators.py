@@ -1,0 +1,152 @@
+"""Limits against the CommonRoad package; controllers, lag and delay against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from vehiclemodels.utils.acceleration_constraints import acceleration_constraints
+from vehiclemodels.utils.steering_constraints import steering_constraints
+
+from cars import package_car, row_of, small_row
+from outlap.simulator import vehicle as column
+from outlap.simulator.actuators import (
+    acceleration,
+    delay_steps,
+    lag,
+    limit_acceleration,
+    limit_steering_rate,
+    steering_rate,
+)
+from outlap.simulator.vehicle import ActuatorParams, VehicleParams, parameter_bounds
+
+cars = st.sampled_from([0, 1, 2, 3])
+compiles = settings(deadline=None)
+
+
+def row_with(**actuators: float) -> np.ndarray:
+    row = parameter_bounds(VehicleParams(), ActuatorParams(**actuators))[0]
+    return row.astype(np.float64)
+
+
+@compiles
+@given(cars, st.floats(-1.2, 1.2), st.floats(-10, 10))
+def test_steering_rate_limits_are_the_packages(number, angle, rate):
+    car = package_car(number)
+    row = row_of(car)
+    for steer in (angle, car.steering.min, car.steering.max):
+        assert limit_steering_rate(rate, steer, row) == steering_constraints(steer, rate, car.steering)
+
+
+@compiles
+@given(cars, st.floats(-1.2, 1.2), st.floats(-30, 30))
+def test_acceleration_limits_are_the_packages(number, fraction, push):
+    car = package_car(number)
+    row, limits = row_of(car), car.longitudinal
+    for speed in (fraction * limits.v_max, limits.v_min, limits.v_max, limits.v_switch, 0.0):
+        expected = acceleration_constraints(speed, push, limits)
+        assert limit_acceleration(push, speed, row) == pytest.approx(expected, rel=1e-12)
+
+
+@compiles
+@given(st.floats(-1, 1), st.floats(-0.4189, 0.4189), st.floats(0.5, 1e7), st.floats(0.001, 0.05))
+def test_steering_never_passes_its_target_nor_a_stop(target, steer, gain, dt):
+    row = row_with()
+    row[column.STEER_GAIN] = gain
+    reachable = min(max(target, row[column.STEER_MIN]), row[column.STEER_MAX])
+    rate = steering_rate(target, steer, dt, row)
+    assert abs(rate) <= row[column.STEER_RATE_MAX]
+    after = steer + rate * dt
+    assert abs(reachable - after) <= abs(reachable - steer) + 1e-12
+    assert (reachable - steer) * (reachable - after) >= -1e-12
+    assert row[column.STEER_MIN] - 1e-12 <= after <= row[column.STEER_MAX] + 1e-12
+
+
+def test_bang_bang_steering_takes_the_full_rate_and_lands_on_the_target():
+    row, steer, dt = row_with(), 0.0, 0.01
+    angles = []
+    for _ in range(12):
+        steer += steering_rate(0.3, steer, dt, row) * dt
+        angles.append(steer)
+    ramp = np.minimum(np.arange(1, 13) * 3.2 * dt, 0.3)
+    np.testing.assert_allclose(angles, ramp, atol=1e-6)
+    assert steering_rate(0.3, angles[-1], dt, row) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_proportional_steering_approaches_geometrically():
+    row, steer, dt = row_with(steer_gain=5.0), 0.0, 0.01
+    for _ in range(20):
+        steer += steering_rate(0.1, steer, dt, row) * dt
+    assert steer == pytest.approx(0.1 * (1 - (1 - 5.0 * dt) ** 20))
+
+
+@pytest.mark.parametrize(
+    ("speed", "target", "expected"),
+    [
+        (5.0, 5.5, 10 * 9.51 / 20 * 0.5),  # forward, faster
+        (5.0, 4.9, -10 * 9.51 / 5 * 0.1),  # forward, slower
+        (-2.0, -1.0, 2 * 9.51 / 20 * 1.0),  # reverse, braking
+        (-2.0, -2.5, -2 * 9.51 / 5 * 0.5),  # reverse, faster
+        (0.0, 2.0, 2 * 9.51 / 20 * 2.0),  # at rest counts as reverse
+    ],
+)
+def test_speed_controller_has_the_gyms_four_gains(speed, target, expected):
+    assert acceleration(target, speed, row_with()) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_car_without_reverse_stops_smoothly():
+    row = row_with()
+    row[column.V_MIN] = 0.0
+    speed = 3.0
+    for _ in range(500):
+        before = speed
+        speed += acceleration(0.0, speed, row) * 0.01
+        assert 0.0 <= speed <= before
+    assert speed < 1e-3
+
+
+@compiles
+@given(st.floats(-5, 20), st.floats(-5, 20))
+def test_speed_never_leaves_its_limits(speed, target):
+    row = row_with()
+    for _ in range(50):
+        speed += acceleration(target, speed, row) * 0.01
+        assert row[column.V_MIN] - 1e-9 <= speed <= row[column.V_MAX] + 1e-9
+
+
+def test_engine_power_limits_acceleration_above_the_switching_speed():
+    row = row_with()
+    power = row[column.A_MAX] * row[column.V_SWITCH]
+    for speed in (8.0, 12.0, 19.0):
+        assert limit_acceleration(100.0, speed, row) * speed == pytest.approx(power)
+    assert limit_acceleration(-100.0, 19.0, row) == -row[column.A_MAX]
+
+
+@compiles
+@given(st.floats(0.001, 1.0), st.floats(0.001, 0.1), st.integers(1, 50))
+def test_lag_is_the_exact_step_response(time_constant, dt, steps):
+    value = 0.0
+    for _ in range(steps):
+        value = lag(value, 1.0, dt, time_constant)
+    assert value == pytest.approx(1 - math.exp(-steps * dt / time_constant), rel=1e-9)
+
+
+def test_no_lag_passes_the_command():
+    assert lag(0.2, 0.7, 0.01, 0.0) == 0.7
+
+
+@pytest.mark.parametrize(
+    ("delay", "steps"), [(0.0, 0), (0.004, 0), (0.006, 1), (0.01, 1), (0.07, 7), (0.1, 10)]
+)
+def test_delays_are_whole_steps(delay, steps):
+    row = parameter_bounds(VehicleParams(), ActuatorParams(steer_delay=delay, speed_delay=2 * delay))[0]
+    assert delay_steps(row, 0.01) == (steps, round(2 * delay / 0.01))
+
+
+def test_scalar_functions_read_float32_rows_too():
+    row = small_row().astype(np.float32)
+    assert steering_rate(0.3, 0.1, 0.01, row) == pytest.approx(3.2, rel=1e-6)
+    assert acceleration(20.0, 5.0, row) == pytest.approx(9.51, rel=1e-6)

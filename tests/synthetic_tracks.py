@@ -1,0 +1,96 @@
+"""Small tracks whose geometry is known in closed form, and simulators with cars put on them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from outlap.simulator.simulator import Simulator, SimulatorConfig
+from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+from outlap.track.centerline import Centerline
+from outlap.track.track import Track
+
+CAR = parameter_bounds(VehicleParams())[0]  # the parameter row of the F1TENTH car
+
+
+def circle(x: float, y: float, radius: float, half_width: float = 1.0) -> Centerline:
+    """A circle, driven anticlockwise from its rightmost point."""
+    angle = np.linspace(0.0, 2.0 * math.pi, 256, endpoint=False)
+    points = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=1)
+    return Centerline.from_points(points, half_width, half_width)
+
+
+def ring(radius: float = 8.0, half_width: float = 1.2, resolution: float = 0.05, yaw: float = 0.0) -> Track:
+    """A circular track about the map frame's origin, on a grid turned by `yaw`."""
+    half = radius + half_width + 0.5
+    count = math.ceil(2.0 * half / resolution)
+    centres = (np.arange(count) + 0.5) * resolution - half
+    distance = np.hypot(*np.meshgrid(centres, centres))
+    occupancy = np.abs(distance - radius) > half_width
+    corner = -half * (math.cos(yaw) - math.sin(yaw)), -half * (math.sin(yaw) + math.cos(yaw))
+    line = circle(0.0, 0.0, radius, half_width)
+    return Track(f"ring{radius:g}", occupancy, resolution, (*corner, yaw), line)
+
+
+def hall(occupancy: np.ndarray, resolution=0.05, origin=(0.0, 0.0, 0.0), radius=5.0) -> Track:
+    """Any map. Its centreline is a circle about the middle, from which `starts_at` can reach every pose."""
+    height, width = occupancy.shape
+    u, v = 0.5 * width * resolution, 0.5 * height * resolution
+    cos, sin = math.cos(origin[2]), math.sin(origin[2])
+    middle = origin[0] + cos * u - sin * v, origin[1] + sin * u + cos * v
+    return Track("hall", occupancy, resolution, origin, circle(*middle, radius))
+
+
+def random_map(rng: np.random.Generator, height: int, width: int, share: float) -> np.ndarray:
+    """Single wall cells, bars one cell thick, and stairs of cells that touch at their corners only."""
+    occupancy = rng.random((height, width)) < share
+    for _ in range(3):
+        row, col, length = rng.integers(height), rng.integers(width), int(rng.integers(5, 20))
+        occupancy[row, col : col + length] = True
+        row, col, length = rng.integers(height), rng.integers(width), int(rng.integers(5, 20))
+        occupancy[row : row + length, col] = True
+        row, col, length = rng.integers(height), rng.integers(width), np.arange(rng.integers(5, 20))
+        rows, cols = row + length, col + rng.choice([-1, 1]) * length
+        inside = (rows < height) & (cols >= 0) & (cols < width)
+        occupancy[rows[inside], cols[inside]] = True
+    return occupancy
+
+
+def starts_at(track: Track, x, y, yaw, speed) -> np.ndarray:
+    """Rows for `Simulator.reset` that put cars at poses of the map frame: (..., 4)."""
+    s, d = track.centerline.to_frenet(x, y)
+    error = np.asarray(yaw) - track.centerline.heading(s)
+    return np.stack(np.broadcast_arrays(s, d, error, speed), axis=-1)
+
+
+def place(tracks, poses, *, speed=0.0, params=CAR, which_track=None, keys=None, **config) -> Simulator:
+    """A simulator with cars at poses of the map frame.
+
+    Args:
+        tracks: one track, or several of which `which_track` (worlds,) says which.
+        poses: (worlds, cars, 3) x [m], y [m], yaw [rad].
+        speed, params: broadcast to (worlds, cars) and (worlds, cars, N_PARAMS).
+        keys: (worlds,) of the sensor noise.
+        config: of `SimulatorConfig`.
+    """
+    tracks = tracks if isinstance(tracks, list) else [tracks]
+    poses = np.asarray(poses, np.float64)
+    worlds, cars, _ = poses.shape
+    which_track = np.zeros(worlds, int) if which_track is None else np.asarray(which_track)
+    speed = np.broadcast_to(speed, (worlds, cars))
+    starts = np.stack(
+        [starts_at(tracks[which_track[w]], *poses[w].T, speed[w]) for w in range(worlds)],
+    )
+    sim = Simulator(tracks, worlds, cars, SimulatorConfig(**config))
+    sim.reset(
+        np.arange(worlds),
+        keys=np.arange(worlds, dtype=np.uint64) if keys is None else np.asarray(keys, np.uint64),
+        tracks=which_track,
+        params=np.broadcast_to(params, (worlds, cars, len(CAR))),
+        starts=starts,
+    )
+    off = sim.worlds.state[..., [0, 1, 4]] - poses
+    off[..., 2] -= 2.0 * math.pi * np.round(off[..., 2] / (2.0 * math.pi))
+    assert np.abs(off).max() < 1e-4, "a pose was not reached"
+    return sim
