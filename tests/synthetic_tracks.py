@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from outlap.simulator.kernels import Worlds
 from outlap.simulator.simulator import Simulator, SimulatorConfig
-from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+from outlap.simulator.state import YAW, X, Y
+from outlap.simulator.vehicle import N_PARAMS, STEER_MAX, STEER_MIN, V_MAX, V_MIN, VehicleParams, parameter_bounds
 from outlap.track.centerline import Centerline
 from outlap.track.track import Track
 
@@ -42,6 +46,12 @@ def hall(occupancy: np.ndarray, resolution=0.05, origin=(0.0, 0.0, 0.0), radius=
     return Track("hall", occupancy, resolution, origin, circle(*middle, radius))
 
 
+def yard(side: float = 40.0) -> Track:
+    """An empty square hall about the map frame's origin."""
+    cells = round(side / 0.1)
+    return hall(np.zeros((cells, cells), bool), 0.1, (-0.5 * side, -0.5 * side, 0.0))
+
+
 def random_map(rng: np.random.Generator, height: int, width: int, share: float) -> np.ndarray:
     """Single wall cells, bars one cell thick, and stairs of cells that touch at their corners only."""
     occupancy = rng.random((height, width)) < share
@@ -57,14 +67,23 @@ def random_map(rng: np.random.Generator, height: int, width: int, share: float) 
     return occupancy
 
 
-def starts_at(track: Track, x, y, yaw, speed) -> np.ndarray:
+def starts_at(track: Track, x: ArrayLike, y: ArrayLike, yaw: ArrayLike, speed: ArrayLike) -> np.ndarray:
     """Rows for `Simulator.reset` that put cars at poses of the map frame: (..., 4)."""
     s, d = track.centerline.to_frenet(x, y)
     error = np.asarray(yaw) - track.centerline.heading(s)
     return np.stack(np.broadcast_arrays(s, d, error, speed), axis=-1)
 
 
-def place(tracks, poses, *, speed=0.0, params=CAR, which_track=None, keys=None, **config) -> Simulator:
+def place(
+    tracks: Track | list[Track],
+    poses: ArrayLike,
+    *,
+    speed: ArrayLike = 0.0,
+    params: np.ndarray = CAR,
+    which_track: ArrayLike | None = None,
+    keys: ArrayLike | None = None,
+    **config: Any,
+) -> Simulator:
     """A simulator with cars at poses of the map frame.
 
     Args:
@@ -78,10 +97,9 @@ def place(tracks, poses, *, speed=0.0, params=CAR, which_track=None, keys=None, 
     poses = np.asarray(poses, np.float64)
     worlds, cars, _ = poses.shape
     which_track = np.zeros(worlds, int) if which_track is None else np.asarray(which_track)
+    x, y, yaw = np.moveaxis(poses, -1, 0)
     speed = np.broadcast_to(speed, (worlds, cars))
-    starts = np.stack(
-        [starts_at(tracks[which_track[w]], *poses[w].T, speed[w]) for w in range(worlds)],
-    )
+    starts = np.stack([starts_at(tracks[which_track[w]], x[w], y[w], yaw[w], speed[w]) for w in range(worlds)])
     sim = Simulator(tracks, worlds, cars, SimulatorConfig(**config))
     sim.reset(
         np.arange(worlds),
@@ -90,7 +108,33 @@ def place(tracks, poses, *, speed=0.0, params=CAR, which_track=None, keys=None, 
         params=np.broadcast_to(params, (worlds, cars, len(CAR))),
         starts=starts,
     )
-    off = sim.worlds.state[..., [0, 1, 4]] - poses
+    off = sim.worlds.state[..., [X, Y, YAW]] - poses
     off[..., 2] -= 2.0 * math.pi * np.round(off[..., 2] / (2.0 * math.pi))
     assert np.abs(off).max() < 1e-4, "a pose was not reached"
     return sim
+
+
+def random_cars(rng: np.random.Generator, worlds: int, cars: int) -> np.ndarray:
+    """Parameter rows within 30 % of the F1TENTH car's."""
+    params = CAR * rng.uniform(0.7, 1.3, (worlds, cars, N_PARAMS))
+    return params.astype(np.float32)
+
+
+def random_commands(rng: np.random.Generator, params: np.ndarray) -> np.ndarray:
+    """At or near the limits of each car, both ways, or nothing: (worlds, cars, 2)."""
+    choice = rng.integers(0, 3, params.shape[:-1])
+    steer = np.choose(choice, [params[..., STEER_MIN], params[..., STEER_MAX], 0.0 * choice])
+    choice = rng.integers(0, 4, params.shape[:-1])
+    speed = np.choose(choice, [params[..., V_MIN], params[..., V_MAX], 0.0 * choice, 0.4 * params[..., V_MAX]])
+    return np.stack([steer, speed], axis=-1)
+
+
+def snapshot(sim: Simulator, world: Any = slice(None)) -> dict[str, np.ndarray]:
+    """Copies of all that is known of some worlds."""
+    return {name: getattr(sim.worlds, name)[world].copy() for name in Worlds._fields}
+
+
+def assert_same(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
+    """Bit for bit."""
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds
 
 
-def row(**changes: float) -> np.ndarray:
+def row(**changes: Any) -> np.ndarray:
     return parameter_bounds(VehicleParams(**changes))[0]
 
 

@@ -177,8 +177,9 @@ def test_a_reset_forgets_laps():
     sim, commands = circling([0.0], 6.0)
     drive_to(sim, commands, 2.1 * LENGTH, 6.0)
     assert sim.worlds.laps[0, 0] == 2
-    worlds = sim.worlds
-    sim.reset([0], keys=[0], tracks=[0], params=worlds.params.copy(), starts=np.array([[[5.0, 0.0, 0.0, 1.0]]]))
+    worlds, world = sim.worlds, np.array([0])
+    starts = np.array([[[5.0, 0.0, 0.0, 1.0]]])
+    sim.reset(world, keys=world, tracks=world, params=worlds.params.copy(), starts=starts)
     assert worlds.laps[0, 0] == 0
     assert worlds.distance[0, 0] == 5.0
     assert np.isnan(worlds.lap_time[0, 0])

@@ -217,10 +217,17 @@ def evaluate_into(
 def show_summary(console: Console, data: Mapping[str, Any]) -> None:
     """Print what an evaluation found, and where it is."""
     trained_on = data["trained_on"]
-    console.print(_table(data, f"{data['driver']}: driving", DRIVING))
-    console.print(_table(data, f"{data['driver']}: the paper's measures", PAPER))
+    each = next(iter(data["tracks"].values()))["episodes"]
     console.print(
-        "mean ± standard deviation over episodes, [95 % interval of the mean]; lap time: of episodes with a lap",
+        f"{data['driver']}: {each} episodes on each track, {data['all']['episodes']} in all",
+        highlight=False, markup=False,
+    )  # fmt: skip
+    for columns in (DRIVING, RACING):
+        console.print()
+        console.print(_table(data, columns))
+    console.print()
+    console.print(
+        "mean ± sd over episodes, [95 % interval of the mean]",
         style="dim", highlight=False, markup=False,
     )  # fmt: skip
     if trained_on:
@@ -230,10 +237,9 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
     console.print(f"results: {data['folder']}", highlight=False, markup=False, soft_wrap=True)
 
 
-DRIVING = ("episodes", "crash_rate", "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m")
-PAPER = ("crashes", "overtakes", "places_lost", "episode_steps", "episode_return")
+DRIVING = ("crash_rate", "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m")
+RACING = ("crashes", "overtakes", "places_lost", "episode_steps", "episode_return")
 HEADINGS = {
-    "episodes": "episodes",
     "crash_rate": "crash rate",
     "completed_laps": "laps",
     "lap_time_s": "lap time [s]",
@@ -247,17 +253,17 @@ HEADINGS = {
 }
 
 
-def _table(data: Mapping[str, Any], title: str, columns: Sequence[str]) -> Table:
+def _table(data: Mapping[str, Any], columns: Sequence[str]) -> Table:
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     table.add_column("track", overflow="fold")
     for column in columns:
-        table.add_column(HEADINGS[column], justify="right", no_wrap=True)
+        table.add_column(Text(HEADINGS[column]), justify="right", no_wrap=True)
     for name, summary in data["tracks"].items():
-        mark = " *" if name in data["trained_on"] else ""
+        mark = "*" if name in data["trained_on"] else ""
         table.add_row(Text(name + mark), *(_cell(summary, column) for column in columns))
     if len(data["tracks"]) > 1:
         table.add_section()
@@ -276,7 +282,7 @@ def _cell(summary: Mapping[str, Any], column: str) -> str:
         return str(value)
     if value["mean"] is None:
         return "-"
-    digits = 0 if column in ("progress_m", "episode_steps") else 2
+    digits = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "episode_return": 1}.get(column, 2)
     if value["sd"] is None:
         return f"{value['mean']:.{digits}f}"
     return (

@@ -172,9 +172,7 @@ class ImportTrack:
             folder = _save(track, prepared / "track")  # refuses a name that cannot be a folder's
             target = cache_folder() / track.name
             if target.exists() and not self.force:
-                raise OutlapError(
-                    f"{target}: this name is taken; give another --name, or --force to replace the track"
-                )
+                raise OutlapError(f"{target}: this name is taken; give another --name, or --force to replace the track")
             install(folder, target)
         return _written(track, target, "cache")
 
@@ -292,9 +290,7 @@ def _written(track: Track, folder: Path, kind: str) -> CommandResult:
     def show(console: Console) -> None:
         _print_summary(console, data)
         _print(console, f"written to: {folder}")
-        console.print(
-            f"to see it: outlap tracks show '{usable_as}'", markup=False, highlight=False, soft_wrap=True
-        )
+        console.print(f"to see it: outlap tracks show '{usable_as}'", markup=False, highlight=False, soft_wrap=True)
         if note:
             _print(console, note)
 

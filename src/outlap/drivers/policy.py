@@ -126,10 +126,11 @@ class PolicyDriver:
         """See `Driver.act`; raises OutlapError for an observation that the policy was not trained on."""
         count = len(observation[next(iter(observation))]) if observation else 0
         for term, box in self._space.spaces.items():
-            shape, needed = np.shape(observation.get(term)), (count, *(box.shape or ()))
-            if shape != needed:
-                found = f"has shape {shape}" if term in observation else "is missing"
-                raise OutlapError(f"{self.name}: observation {term!r} {found}; must have shape {needed}")
+            if term not in observation:
+                raise OutlapError(f"{self.name}: needs the observation {term!r}; it is given {', '.join(observation)}")
+            found, needed = observation[term].shape, (count, *(box.shape or ()))
+            if found != needed:
+                raise OutlapError(f"{self.name}: observation {term!r} has shape {found}; must be {needed}")
         if self._random is None:
             return self._act(observation, count)
         import torch

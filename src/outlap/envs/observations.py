@@ -98,7 +98,9 @@ def observation_space(terms: Sequence[str], beams: int, max_range: float, scaled
     for name in terms:
         term = OBSERVATION_TERMS[name]
         shape = (beams if term.size is None else term.size,)
-        low, high, scale = (np.broadcast_to(np.float32(ends), shape) for ends in (term.low, term.high, term.scale))
+        low, high, scale = (
+            np.broadcast_to(np.asarray(ends, np.float32), shape) for ends in (term.low, term.high, term.scale)
+        )
         if name == "scan":
             high = np.full(shape, max_range, np.float32)
         if scaled:
@@ -115,7 +117,7 @@ def observe(race: Race, car: int, terms: Sequence[str], scaled: bool) -> dict[st
         value = term.read(race, car)
         if scaled:
             # Divided as the space's bounds are: times the reciprocal could round to just outside of them.
-            observation[name] = np.divide(value, np.float32(term.scale), dtype=np.float32)
+            observation[name] = np.divide(value, np.asarray(term.scale, np.float32), dtype=np.float32)
         else:
             observation[name] = np.array(value, dtype=np.float32)
     return observation

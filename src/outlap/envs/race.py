@@ -34,6 +34,7 @@ class Race:
     farthest_before: np.ndarray = field(init=False)  # one step ago [m]
     farthest_time: np.ndarray = field(init=False)  # when that last grew by STALL_DISTANCE or more [s]
     stall_mark: np.ndarray = field(init=False)  # (worlds,) distance at that time [m]
+    stalled: np.ndarray = field(init=False)  # bool (worlds,): this step ended the episode for want of progress
     ahead: np.ndarray = field(init=False)  # (worlds, cars) whether the ego is ahead of each car
     places_gained: np.ndarray = field(init=False)  # (worlds,) in this step
     places_lost: np.ndarray = field(init=False)
@@ -52,6 +53,7 @@ class Race:
             "stall_mark",
         ):
             setattr(self, name, np.zeros(worlds))
+        self.stalled = np.zeros(worlds, bool)
         self.ahead = np.zeros((worlds, cars), bool)
         self.places_gained = np.zeros(worlds, np.int64)
         self.places_lost = np.zeros(worlds, np.int64)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from outlap.config import Config, Number
+from outlap.config import Config, Number, bounded
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.simulator.simulator import SimulatorConfig
@@ -22,7 +22,7 @@ class StartConfig(Config):
     speed: Number = 0.0  # of every car [m/s]
     offset: float = Field(default=0.5, ge=0, le=1)  # largest, as a share of the room to the track's edge
     heading_error: float = Field(default=0.1, ge=0)  # largest [rad]
-    gap: Number = (1.5, 4.0)  # between one car and the next along the track [m]
+    gap: Annotated[Number, bounded(at_least=0)] = (1.5, 4.0)  # between one car and the next along the track [m]
 
 
 def _vehicle_preset(value: Any) -> Any:
@@ -32,7 +32,7 @@ def _vehicle_preset(value: Any) -> Any:
     if isinstance(value, dict) and "preset" in value:
         changes = dict(value)
         name = changes.pop("preset")
-        if name not in PRESETS:
+        if not isinstance(name, str) or name not in PRESETS:
             raise ValueError(f"preset {name!r} is unknown; there are {', '.join(PRESETS)}")
         return {**PRESETS[name].model_dump(), **changes}
     return value
@@ -42,8 +42,9 @@ class RaceConfig(SimulatorConfig):
     """An environment. The same names are keywords of `gymnasium.make` and flags of the commands."""
 
     tracks: tuple[str, ...] = ()  # names or paths, one drawn at each reset; none: the built-in training set
+    augment_tracks: bool = False  # race each track also the other way round, mirrored, and both
     num_cars: int = Field(default=1, ge=1, le=64)  # the ego and its opponents
-    opponent_speed: Number = 3.0  # top speed of the opponents, drawn per opponent [m/s]
+    opponent_speed: Annotated[Number, bounded(at_least=0)] = 3.0  # their top speed, drawn per opponent [m/s]
     control_interval: int = Field(default=1, ge=1, le=1000)  # physics steps per action
     speed_range: tuple[float, float] | None = None  # [m/s] of the action's second number; None: v_min, v_max
     vehicle: Annotated[VehicleParams, BeforeValidator(_vehicle_preset)] = VehicleParams()

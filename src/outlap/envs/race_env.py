@@ -9,12 +9,19 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.errors import OutlapError
 
 
 class RaceEnv(gym.Env):
-    """One race. Spaces, keywords and `info` are those of a world of `RaceVectorEnv`."""
+    """One race. Spaces, keywords and `info` are those of a world of `RaceVectorEnv`.
+
+    `lap_time_s` and `last_lap_time_s` come into `info` with the first completed lap.
+    """
 
     def __init__(self, **config: Any) -> None:
+        for name in ("num_envs", "autoreset_mode"):
+            if name in config:
+                raise OutlapError(f"{name}: a single race has none; take gymnasium.make_vec or RaceVectorEnv")
         self._env = RaceVectorEnv(1, autoreset_mode=AutoresetMode.DISABLED, **config)
         self.config = self._env.config
         self.observation_space = self._env.single_observation_space
@@ -37,6 +44,7 @@ class RaceEnv(gym.Env):
 
 
 def _only(batch: dict[str, Any]) -> dict[str, Any]:
-    """The one world's values; masks left out."""
-    values = {name: value[0] for name, value in batch.items() if not name.startswith("_")}
+    """The one world's values; masks, and what they say is not known, left out."""
+    known = {name: value for name, value in batch.items() if not name.startswith("_") and batch.get(f"_{name}", [1])[0]}
+    values = {name: value[0] for name, value in known.items()}
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,8 +18,8 @@ from outlap.envs.observations import observation_space, observe
 from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import REWARD_TERMS, reference_speeds
-from outlap.envs.tasks import TaskSet, load_tracks
-from outlap.envs.terminations import RUNNING, outcomes
+from outlap.envs.tasks import TaskSet, load_tracks, track_name
+from outlap.envs.terminations import RUNNING, STALLED, outcomes
 from outlap.errors import OutlapError
 from outlap.seeding import DRIVER_STREAM, START_STREAM, uniform, world_keys
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
@@ -30,6 +31,7 @@ from outlap.track.track import Track
 
 START_MARGIN = 0.1  # [m] that a start leaves between the car and the track's edge
 START_ATTEMPTS = 20
+OFFERED_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 EPISODE_FIELDS = (
     "episode_return", "episode_steps", "progress_m", "mean_speed_mps", "completed_laps", "lap_time_s",
     "overtakes", "places_lost", "impact_speed_mps",
@@ -50,7 +52,7 @@ class RaceVectorEnv(VectorEnv):
         self,
         num_envs: int = 1,
         *,
-        tracks: Sequence[str | Track] | str | Track = (),
+        tracks: Sequence[str | os.PathLike[str] | Track] | str | os.PathLike[str] | Track = (),
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: None = None,
         **config: Any,
@@ -67,38 +69,30 @@ class RaceVectorEnv(VectorEnv):
 
         Raises OutlapError for an unknown or wrong field, a track that cannot be loaded.
         """
-        names = [tracks] if isinstance(tracks, (str, Track)) else list(tracks)
+        names = list(tracks) if isinstance(tracks, Sequence) and not isinstance(tracks, str) else [tracks]
         if not names:
             from outlap.track.generate import BUILTIN_TRAIN
 
             names = list(BUILTIN_TRAIN)
-        loaded = load_tracks(names)
-        self.config = validate(
-            RaceConfig,
-            {**config, "tracks": tuple(n if isinstance(n, str) else n.name for n in names)},
-            "outlap/Race-v0",
-        )
+        self.config = validate(RaceConfig, {**config, "tracks": tuple(map(track_name, names))}, "outlap/Race-v0")
+        if autoreset_mode not in (*OFFERED_MODES, *(mode.value for mode in OFFERED_MODES)):
+            raise OutlapError(f"autoreset_mode is {autoreset_mode!r}; SAME_STEP and DISABLED are offered")
+        loaded = load_tracks(names, self.config.augment_tracks)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            raise OutlapError("autoreset_mode: NEXT_STEP is not offered; take SAME_STEP or DISABLED")
         if render_mode is not None:
             raise OutlapError(f"render_mode is {render_mode!r}; only None is offered")
-        if num_envs < 1:
-            raise OutlapError(f"num_envs is {num_envs}; it must be at least 1")
+        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
+            raise OutlapError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1")
         self.num_envs = num_envs
         self.render_mode = None
-        interval = self.config.control_interval * self.config.timestep
-        self.metadata = {
-            "autoreset_mode": self.autoreset_mode,
-            "render_modes": [],
-            "render_fps": round(1 / interval),
-        }
 
         self.tasks = TaskSet(loaded, self.config.vehicle, self.config.actuators, self.config.lidar)
         simulator = Simulator(loaded, num_envs, self.config.num_cars, self.config, self.tasks.max_delay)
         typical = np.mean(parameter_bounds(self.config.vehicle), axis=0)
         self.race = Race(simulator, reference_speeds(loaded, simulator.atlas, typical))
         self._weights = self.config.reward.resolved()
+        interval = self.config.control_interval * self.config.timestep
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": [], "render_fps": round(1 / interval)}
 
         self.single_observation_space = observation_space(
             self.config.observation, self.config.beams, bounds(self.config.lidar.max_range)[1],
@@ -114,7 +108,6 @@ class RaceVectorEnv(VectorEnv):
         self._episode = np.zeros(num_envs, np.int64)  # number of each world's episode since it was seeded
         self._over = np.ones(num_envs, bool)  # waits for a reset
         self._names = np.array([track.name for track in loaded], dtype=object)
-        self._vehicles = simulator.worlds.params.copy()
         self._totals = {name: np.zeros(num_envs) for name in (*EPISODE_FIELDS, *self._weights)}
 
     @property
@@ -135,7 +128,10 @@ class RaceVectorEnv(VectorEnv):
         so that every episode differs.
         """
         mask = None if options is None else options.get("reset_mask")
-        which = np.arange(self.num_envs) if mask is None else np.flatnonzero(np.asarray(mask, bool))
+        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise OutlapError(f"reset_mask is {mask.dtype} {mask.shape}; it must be bool ({self.num_envs},)")
+        which = np.flatnonzero(mask)
         self._seed(seed, which)
         self._begin(which)
         return self._observe(), self._info()
@@ -157,8 +153,9 @@ class RaceVectorEnv(VectorEnv):
         race.advance(config.termination.stall_distance)
         race.training_steps += self.num_envs
 
-        rewards = self._reward()
         outcome = outcomes(race, config.termination)
+        race.stalled[:] = outcome == STALLED
+        rewards = self._reward()
         terminated = race.crashed.copy()
         truncated = ~terminated & (outcome != RUNNING)
         self._count(rewards)
@@ -175,9 +172,9 @@ class RaceVectorEnv(VectorEnv):
             final_obs = np.full(self.num_envs, None, dtype=object)
             for world in which:
                 final_obs[world] = {name: value[world] for name, value in final.items()}
-            info = self._info()
+            known, info = info, self._info()
             info["final_obs"], info["_final_obs"] = final_obs, over
-            info["final_info"] = {**final_info, **{f"_{name}": over for name in final_info}}
+            info["final_info"] = {**final_info, **{f"_{name}": over & known[f"_{name}"] for name in final_info}}
             info["_final_info"] = over
             return observation, rewards, terminated, truncated, info
         return self._observe(), rewards, terminated, truncated, info
@@ -186,13 +183,17 @@ class RaceVectorEnv(VectorEnv):
         """Nothing is open."""
 
     def _seed(self, seed: int | Sequence[int | None] | None, which: np.ndarray) -> None:
-        if seed is None and self._keys is None:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
-        if self._keys is None:
-            self._keys = np.zeros(self.num_envs, np.uint64)
+        if self._keys is None:  # random until a seed is given
+            self._keys = np.random.SeedSequence().generate_state(self.num_envs, np.uint64)
         if seed is None:
             return
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
+        if isinstance(seed, (int, np.integer)):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed) if isinstance(seed, (Sequence, np.ndarray)) else [seed]
+        for each in seeds:
+            if each is not None and not (isinstance(each, (int, np.integer)) and each >= 0):
+                raise OutlapError(f"seed is {each!r}; it must be a whole number, 0 or more")
         if len(seeds) != self.num_envs:
             raise OutlapError(f"seed: {len(seeds)} given for {self.num_envs} worlds; give one, or one a world")
         self._np_random_seed = seeds[0] if seeds[0] is not None else -1
@@ -235,8 +236,6 @@ class RaceVectorEnv(VectorEnv):
             name = self._names[tracks[waiting[0]]]
             raise OutlapError(f"track {name}: found no start free of contact; is it as wide as the car?")
         self.race.begin(which)
-        self._vehicles = worlds.params.copy()
-        self._vehicles.setflags(write=False)
         self._over[which] = False
         for total in self._totals.values():
             total[which] = 0.0
@@ -272,7 +271,10 @@ class RaceVectorEnv(VectorEnv):
 
     def _all_actions(self, actions: np.ndarray) -> np.ndarray:
         """The ego's actions, checked and clipped, with those of the opponents: (worlds, cars, 2)."""
-        actions = np.asarray(actions, np.float32)
+        try:
+            actions = np.asarray(actions, np.float32)
+        except (TypeError, ValueError):
+            raise OutlapError(f"actions are {actions!r:.60}; they must be numbers ({self.num_envs}, 2)") from None
         if actions.shape != (self.num_envs, 2):
             raise OutlapError(f"actions have shape {actions.shape}; they must be ({self.num_envs}, 2)")
         if self._over.any():
@@ -322,12 +324,14 @@ class RaceVectorEnv(VectorEnv):
         info: dict[str, Any] = {
             "outcome": np.full(self.num_envs, RUNNING) if outcome is None else outcome,
             "track": self._names[worlds.track],
-            "vehicle": self._vehicles,
+            "vehicle": worlds.params.copy(),
+            "opponent_speed_mps": self._opponent_speed[:, 1:].copy(),
             "laps": worlds.laps[:, EGO].copy(),
             "last_lap_time_s": worlds.lap_time[:, EGO].copy(),
             "time_s": worlds.time.copy(),
             **{name: total.copy() for name, total in self._totals.items() if name in EPISODE_FIELDS},
             **{f"reward_{name}": self._totals[name].copy() for name in self._weights},
         }
-        everywhere = np.ones(self.num_envs, bool)
-        return {**info, **{f"_{name}": everywhere for name in info}}
+        known = dict.fromkeys(info, np.ones(self.num_envs, bool))
+        known["lap_time_s"] = known["last_lap_time_s"] = worlds.laps[:, EGO] > 0
+        return {**info, **{f"_{name}": mask for name, mask in known.items()}}

@@ -78,6 +78,11 @@ def collision(race: Race, config: RewardConfig) -> np.ndarray:
     return np.where(race.crashed, -(1.0 + (config.collision_max - 1.0) * growth), 0.0)
 
 
+def stall(race: Race, config: RewardConfig) -> np.ndarray:
+    """-1 where the episode ends because the ego gets no further: else a careful policy would rather stand."""
+    return -race.stalled.astype(np.float64)
+
+
 def velocity_matching(race: Race, config: RewardConfig) -> np.ndarray:
     """-(v - v_ref)^2 w(t) [m^2/s^2]: w falls over training from 1 to 0 as a sigmoid."""
     rows = race.line_rows(EGO, np.zeros(1))[:, 0]
@@ -107,6 +112,7 @@ REWARD_TERMS: dict[str, Callable[[Race, RewardConfig], np.ndarray]] = {
     "progress": progress,
     "lap_progress": lap_progress,
     "collision": collision,
+    "stall": stall,
     "velocity_matching": velocity_matching,
     "steering_change": steering_change,
     "speed_change": speed_change,

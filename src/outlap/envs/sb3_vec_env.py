@@ -9,6 +9,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
+from outlap.errors import OutlapError
 
 # Of every world at every step; the rest of the information is given when an episode ends.
 EVERY_STEP = ("track",)
@@ -22,6 +23,8 @@ class SB3VecEnv(VecEnv):
     """
 
     def __init__(self, num_envs: int = 1, **config: Any) -> None:
+        if "autoreset_mode" in config:
+            raise OutlapError("autoreset_mode: Stable-Baselines3 knows only SAME_STEP; leave it out")
         self.env = RaceVectorEnv(num_envs, **config)
         self.render_mode = None
         self._actions = np.zeros((num_envs, 2), np.float32)

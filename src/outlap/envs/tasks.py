@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -68,11 +69,32 @@ class TaskSplit:
     held_out: TaskSet
 
     def __post_init__(self) -> None:
-        both = {track.name for track in self.train.tracks} & {track.name for track in self.held_out.tracks}
+        both = set(map(_circuit, self.train.tracks)) & set(map(_circuit, self.held_out.tracks))
         if both:
             raise OutlapError(f"tracks: {sorted(both)} are both trained on and held out; take them from one set")
 
 
-def load_tracks(names: Sequence[str | Track]) -> tuple[Track, ...]:
-    """Tracks by name or path; one that is loaded already is taken as it is."""
-    return tuple(track if isinstance(track, Track) else Track.load(track) for track in names)
+def _circuit(track: Track) -> str:
+    """The name of the circuit, whichever way it is driven or seen."""
+    return track.name.removesuffix(" mirrored").removesuffix(" reversed")
+
+
+def track_name(track: str | os.PathLike[str] | Track) -> str:
+    """What a configuration calls a track: its name, or the path that was given."""
+    if not isinstance(track, (str, os.PathLike, Track)):
+        raise OutlapError(f"tracks: {track!r:.60} is not a track; give a name, a map folder or a Track")
+    return track.name if isinstance(track, Track) else os.fspath(track)
+
+
+def load_tracks(names: Sequence[str | os.PathLike[str] | Track], augment: bool = False) -> tuple[Track, ...]:
+    """Tracks by name or path; one that is loaded already is taken as it is.
+
+    Args:
+        names: of the tracks.
+        augment: add each one driven the other way round, mirrored, and both.
+    """
+    tracks = tuple(name if isinstance(name, Track) else Track.load(name) for name in names)
+    if not augment:
+        return tracks
+    both_ways = [way for track in tracks for way in (track, track.reversed())]
+    return tuple(seen for track in both_ways for seen in (track, track.mirrored()))

@@ -65,6 +65,7 @@ def standing_starts(
         time_limit = (laps + 1) * max(track.centerline.length for track in tracks) / CRAWL
     changes = {
         "tracks": tuple(track.name for track in tracks),
+        "augment_tracks": False,
         "start": StartConfig(anywhere=True, speed=0.0, gap=env.start.gap),
         "termination": TerminationConfig(laps=laps, time_limit=time_limit),
     }
@@ -106,7 +107,8 @@ def evaluate(
         driver, outcome, terminated, truncated, episode_steps, duration_s, episode_return, last_reward,
         overtakes, places_lost, completed_laps, lap_time_s (mean of its laps, NaN without one), start_m (arc
         length), progress_m, mean_speed_mps, impact_speed_mps (NaN without a crash), and one column for each of
-        the ego's parameters that is drawn, such as vehicle_mu.
+        the ego's parameters that is drawn, such as vehicle_mu, and for the speed of each opponent if that is
+        drawn (opponent_1_speed_mps).
 
     Raises OutlapError for tracks that cannot be loaded or share a name, an observation that the driver does
     not take, episodes that may never end.
@@ -159,6 +161,8 @@ def _race(
     if isinstance(driver, PolicyDriver):
         driver.check(env.single_observation_space)
     drawn = drawn_parameters(config)
+    opponents = range(1, config.num_cars if isinstance(config.opponent_speed, tuple) else 1)
+    length = track.centerline.length
     rows: dict[int, dict[str, Any]] = {}
     racing = np.arange(worlds)  # the episode of each world
     upcoming = worlds
@@ -181,8 +185,9 @@ def _race(
                 "terminated": bool(terminated[world]),
                 "truncated": bool(truncated[world]),
                 "last_reward": float(rewards[world]),
-                "start_m": float(start[world] % track.centerline.length),
+                "start_m": float(start[world] % length),
                 **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
+                **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in opponents},
             }
         if over.any():
             again: list[int | None] = [None] * worlds  # an idle world goes on with a stream of its own
@@ -193,7 +198,7 @@ def _race(
                     upcoming += 1
             observation, info = env.reset(seed=again, options={"reset_mask": over})
             start[over] = env.race.start[over]
-        watch(len(rows), len(rows) + _underway(config, track, info, racing != IDLE), steps)
+        watch(len(rows), len(rows) + _underway(config, length, start, info, racing != IDLE), steps)
     return [rows[episode] for episode in range(len(seeds))], steps
 
 
@@ -201,6 +206,7 @@ def _settings(driver: Driver, config: RaceConfig, track: Track) -> dict[str, Any
     """Keywords of the environment that this driver needs."""
     settings = dict(config)
     settings["tracks"] = [track]
+    settings["augment_tracks"] = False  # the track that was named, not one of its variants
     settings["observation"] = driver.observation_terms
     settings["scale_observations"] = driver.scale_observations
     if "scan" not in driver.observation_terms:
@@ -226,15 +232,16 @@ def _row(info: dict[str, Any], world: int) -> dict[str, Any]:
     }
 
 
-def _underway(config: RaceConfig, track: Track, info: dict[str, Any], racing: np.ndarray) -> float:
-    """How many episodes' worth of racing the running ones have behind them, roughly."""
+def _underway(config: RaceConfig, length: float, start: np.ndarray, info: dict[str, Any], racing: np.ndarray) -> float:
+    """How many episodes' worth of racing the running ones have behind them; less than their number."""
     rules = config.termination
     share = np.zeros(len(racing))
     if rules.time_limit:
         share = info["time_s"] / rules.time_limit
     if rules.laps:
-        share = np.maximum(share, info["progress_m"] / (rules.laps * track.centerline.length))
-    return float(np.clip(share[racing], 0.0, 1.0).sum())
+        to_line = length - start % length
+        share = np.maximum(share, info["progress_m"] / (to_line + rules.laps * length))
+    return float(np.clip(share[racing], 0.0, 0.999).sum())
 
 
 def drawn_parameters(config: RaceConfig) -> dict[str, int]:

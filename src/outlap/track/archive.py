@@ -29,9 +29,7 @@ class ArchiveLimits:
     members: int = 100  # files and folders
 
 
-def extract(
-    archive: Path, folder: Path, limits: ArchiveLimits | None = None, called: str | None = None
-) -> list[Path]:
+def extract(archive: Path, folder: Path, limits: ArchiveLimits | None = None, called: str | None = None) -> list[Path]:
     """Unpack the .tar.xz file `archive` into the existing, empty `folder`; hidden files are left out.
 
     Args:

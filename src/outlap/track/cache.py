@@ -44,8 +44,7 @@ def staging(folder: Path, wait_s: float = 600.0) -> Iterator[Path]:
         lock = (folder / ".lock").open("a+b")
     except OSError as error:
         raise OutlapError(
-            f"{folder}: cannot write here ({error.strerror}); "
-            f"set {CACHE_VARIABLE} to a folder that you can write to"
+            f"{folder}: cannot write here ({error.strerror}); set {CACHE_VARIABLE} to a folder that you can write to"
         ) from error
     with lock:
         _wait_for(lock, folder, wait_s)
@@ -77,8 +76,7 @@ def _wait_for(lock: IO[bytes], folder: Path, wait_s: float) -> None:
     while not _try_lock(lock):
         if time.monotonic() >= give_up:
             raise OutlapError(
-                f"{folder}: another process has been writing here for more than {wait_s:.0f} s; "
-                "wait for it, or end it"
+                f"{folder}: another process has been writing here for more than {wait_s:.0f} s; wait for it, or end it"
             )
         time.sleep(0.1)
 

@@ -160,9 +160,7 @@ class Centerline:
         WIDTH_RIGHT, WIDTH_LEFT.
         """
         if not (math.isfinite(spacing) and spacing > 0.0):
-            raise OutlapError(
-                f"centreline table: spacing is {spacing}; it must be a positive number of metres"
-            )
+            raise OutlapError(f"centreline table: spacing is {spacing}; it must be a positive number of metres")
         rows = max(MIN_POINTS, math.ceil(self.length / spacing - 1e-9))
         s = np.arange(rows) * (self.length / rows)
         table = np.empty((rows, TABLE_COLUMNS), dtype=np.float32)
@@ -238,9 +236,7 @@ def _fit_drivable(points: np.ndarray) -> tuple[CubicSpline, CubicHermiteSpline, 
     chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
     count = max(256, math.ceil(chord[-1] / 0.01))
     spacing = chord[-1] / count
-    dense = np.column_stack(
-        [np.interp(np.arange(count) * spacing, chord, closed[:, axis]) for axis in (0, 1)]
-    )
+    dense = np.column_stack([np.interp(np.arange(count) * spacing, chord, closed[:, axis]) for axis in (0, 1)])
     at = np.append(np.arange(count), count) * spacing
     for width in _SMOOTHING:
         smooth = ndimage.gaussian_filter1d(dense, width / spacing, axis=0, mode="wrap")

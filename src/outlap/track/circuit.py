@@ -247,9 +247,7 @@ def _turns(vertices: np.ndarray) -> np.ndarray:
     return np.angle(leaving / np.roll(leaving, 1))
 
 
-def _fit_radii(
-    vertices: np.ndarray, sketch: _Sketch, min_radius: float, clearance: float
-) -> np.ndarray | None:
+def _fit_radii(vertices: np.ndarray, sketch: _Sketch, min_radius: float, clearance: float) -> np.ndarray | None:
     """A radius for each corner, such that no two corners of an edge overlap."""
     turns = np.abs(_turns(vertices))
     if np.any(turns > SHARPEST) or np.any(turns < 1e-6):
@@ -322,9 +320,7 @@ def _keeps_clear(points: np.ndarray, length: float, clearance: float) -> bool:
     of that radius are as far apart as its diameter, unless another part of the track comes near.
     """
     coarse = points[:: max(1, int(0.1 * clearance * len(points) / length))]
-    pairs = KDTree(np.column_stack((np.real(coarse), np.imag(coarse)))).query_pairs(
-        clearance, output_type="ndarray"
-    )
+    pairs = KDTree(np.column_stack((np.real(coarse), np.imag(coarse)))).query_pairs(clearance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(coarse) - apart) * length / len(coarse)
     return bool(np.all(apart <= 1.05 * math.pi / 2 * clearance))

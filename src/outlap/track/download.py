@@ -132,9 +132,7 @@ def _download(
         locked = read_lock(cache)
         if folder.exists():
             if name not in locked:
-                raise OutlapError(
-                    f"{folder}: is there and was not downloaded; move it away to download {name}"
-                )
+                raise OutlapError(f"{folder}: is there and was not downloaded; move it away to download {name}")
             if not update_lock:
                 return DownloadedTrack(name, folder, "present", locked[name])
 
@@ -170,9 +168,7 @@ def _official_name(name: str) -> str:
         if name_key(name) == name_key(official):
             return official
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
-        raise OutlapError(
-            f"{name!r} cannot be the name of a track in the archive; the official ones are {_OFFICIAL}"
-        )
+        raise OutlapError(f"{name!r} cannot be the name of a track in the archive; the official ones are {_OFFICIAL}")
     return name
 
 

@@ -130,8 +130,7 @@ def _validate(seed: int, length: float, width: float, min_radius: float, resolut
         )
     if resolution > width / 10:
         raise OutlapError(
-            f"generate_track: resolution is {resolution}; must be at most a tenth of"
-            f" the width, {width / 10:.3g} m"
+            f"generate_track: resolution is {resolution}; must be at most a tenth of the width, {width / 10:.3g} m"
         )
     if length > LONGEST:
         raise OutlapError(f"generate_track: length is {length}; must be at most {LONGEST:.0f} m")

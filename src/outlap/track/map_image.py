@@ -40,9 +40,7 @@ def read_map(path: Path) -> MapImage:
     fields = _read_yaml(path)
     resolution = _number(path, fields, "resolution", "a positive number of metres per pixel")
     if resolution <= 0.0:
-        raise OutlapError(
-            f"{path}: resolution is {resolution}; it must be a positive number of metres per pixel"
-        )
+        raise OutlapError(f"{path}: resolution is {resolution}; it must be a positive number of metres per pixel")
     return MapImage(_read_occupancy(path, fields), resolution, _origin(path, fields))
 
 
@@ -69,9 +67,7 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
         problem = getattr(error, "problem", None) or type(error).__name__
         raise OutlapError(f"{path}: is not valid yaml{where}: {' '.join(str(problem).split())}") from None
     if not isinstance(fields, Mapping):
-        raise OutlapError(
-            f"{path}: holds {brief(fields)}; it must be a mapping with image, resolution and origin"
-        )
+        raise OutlapError(f"{path}: holds {brief(fields)}; it must be a mapping with image, resolution and origin")
     for field in ("image", "resolution", "origin"):
         if fields.get(field) is None:
             raise OutlapError(f"{path}: {field} is missing; a map needs image, resolution and origin")
@@ -99,9 +95,7 @@ def _read_occupancy(path: Path, fields: Mapping[str, Any]) -> np.ndarray:
 
 def _image_path(yaml_path: Path, image: object) -> Path:
     if not isinstance(image, str) or not image.strip():
-        raise OutlapError(
-            f"{yaml_path}: image is {brief(image)}; it must be the name of a file in the folder"
-        )
+        raise OutlapError(f"{yaml_path}: image is {brief(image)}; it must be the name of a file in the folder")
     folder = yaml_path.parent.resolve()
     try:
         path = (folder / image).resolve()

@@ -67,9 +67,7 @@ def write_track(track: Track, folder: str | os.PathLike[str]) -> Path:
     folder = Path(folder)
     name = track.name
     if not name or name.startswith(".") or set(name) & set('/\\\0\n\r:"'):
-        raise OutlapError(
-            f"track name {name!r}: cannot be a file's name; use letters, digits, spaces, - and _"
-        )
+        raise OutlapError(f"track name {name!r}: cannot be a file's name; use letters, digits, spaces, - and _")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -87,9 +85,7 @@ def write_track(track: Track, folder: str | os.PathLike[str]) -> Path:
         raceline_path.unlink(missing_ok=True)
     else:
         race = track.raceline
-        columns = np.column_stack(
-            [race.s, race.x, race.y, race.heading, race.curvature, race.speed, race.acceleration]
-        )
+        columns = np.column_stack([race.s, race.x, race.y, race.heading, race.curvature, race.speed, race.acceleration])
         atomic_write(raceline_path, _csv_text(RACELINE_COLUMNS, columns, "; "))
 
     fields = {
@@ -188,9 +184,7 @@ def _csv_beside(folder: Path, name: str, ending: str) -> Path | None:
     found = [path for path in _visible_files(folder) if path.name.endswith(ending)]
     if len(found) > 1:
         names = ", ".join(path.name for path in found[:5])
-        raise OutlapError(
-            f"{folder}: has {len(found)} files *{ending} ({names}); name the map's {name}{ending}"
-        )
+        raise OutlapError(f"{folder}: has {len(found)} files *{ending} ({names}); name the map's {name}{ending}")
     return found[0] if found else None
 
 
@@ -223,16 +217,12 @@ def _read_csv(path: Path, columns: tuple[str, ...]) -> tuple[np.ndarray, list[in
         row = []
         for cell, number, column in zip(cells, numbers, columns, strict=True):
             if number is None or not math.isfinite(number):
-                raise OutlapError(
-                    f"{path}: line {line}: {column} is {brief(cell)}; it must be a finite number"
-                )
+                raise OutlapError(f"{path}: line {line}: {column} is {brief(cell)}; it must be a finite number")
             row.append(number)
         rows.append(row)
         lines.append(line)
     if len(rows) < MIN_POINTS:
-        raise OutlapError(
-            f"{path}: has {len(rows)} points; it must have at least {MIN_POINTS} rows of {expected}"
-        )
+        raise OutlapError(f"{path}: has {len(rows)} points; it must have at least {MIN_POINTS} rows of {expected}")
     return np.array(rows), lines
 
 
@@ -281,6 +271,5 @@ def _require_clear_centerline(track: Track, path: Path) -> None:
         else ("leaves the map", "all of it must lie inside")
     )
     raise OutlapError(
-        f"{path}: the centreline {what} at s = {s[first]:.2f} m, "
-        f"x_m = {x[first]:.3f}, y_m = {y[first]:.3f}; {right}"
+        f"{path}: the centreline {what} at s = {s[first]:.2f} m, x_m = {x[first]:.3f}, y_m = {y[first]:.3f}; {right}"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -35,18 +35,13 @@ class Track:
     def __post_init__(self) -> None:
         occupancy = np.array(self.occupancy, dtype=bool, order="C")  # a copy: nobody else can write to it
         if occupancy.ndim != 2 or occupancy.size == 0:
-            raise OutlapError(
-                f"track {self.name}: occupancy has shape {occupancy.shape}; must be (height, width)"
-            )
+            raise OutlapError(f"track {self.name}: occupancy has shape {occupancy.shape}; must be (height, width)")
         if not (math.isfinite(self.resolution) and self.resolution > 0.0):
             raise OutlapError(
-                f"track {self.name}: resolution is {self.resolution}; "
-                "it must be a positive number of metres per pixel"
+                f"track {self.name}: resolution is {self.resolution}; it must be a positive number of metres per pixel"
             )
         if len(self.origin) != 3 or not all(map(math.isfinite, self.origin)):
-            raise OutlapError(
-                f"track {self.name}: origin is {self.origin}; it must be (x, y, yaw), all finite"
-            )
+            raise OutlapError(f"track {self.name}: origin is {self.origin}; it must be (x, y, yaw), all finite")
         occupancy.setflags(write=False)
         object.__setattr__(self, "occupancy", occupancy)
         object.__setattr__(self, "origin", tuple(map(float, self.origin)))
@@ -62,9 +57,7 @@ class Track:
 
         path = Path(path_or_name).expanduser()
         text = os.fspath(path_or_name)
-        is_bare_name = (
-            isinstance(path_or_name, str) and not {"/", os.sep} & set(text) and text not in (".", "..")
-        )
+        is_bare_name = isinstance(path_or_name, str) and not {"/", os.sep} & set(text) and text not in (".", "..")
         if path.is_file() and path.suffix.lower() == ".csv":
             return map_io.read_tum_centerline(path)
         # A folder that merely shares a track's name is not that track.
@@ -82,6 +75,30 @@ class Track:
         from outlap.track import map_io
 
         return map_io.write_track(self, folder)
+
+    def reversed(self) -> Track:
+        """The same circuit driven the other way round; the racing line, made for this way, is left out."""
+        line = self.centerline
+        order = np.roll(np.arange(len(line.points))[::-1], 1)  # the start line stays where it is
+        backwards = Centerline.from_points(line.points[order], line.width_left[order], line.width_right[order])
+        return replace(self, name=f"{self.name} reversed", centerline=backwards, raceline=None)
+
+    def mirrored(self) -> Track:
+        """The circuit seen in a mirror, x → -x: every left turn becomes a right turn."""
+        x, y, yaw = self.origin
+        across = self.occupancy.shape[1] * self.resolution
+        line, racing = self.centerline, self.raceline
+        if racing is not None:
+            racing = replace(racing, x=-racing.x, heading=np.pi - racing.heading, curvature=-racing.curvature)
+        return Track(
+            name=f"{self.name} mirrored",
+            occupancy=self.occupancy[:, ::-1],
+            resolution=self.resolution,
+            # The corner that was lower right.
+            origin=(-x - across * math.cos(yaw), y + across * math.sin(yaw), -yaw),
+            centerline=Centerline.from_points(line.points * [-1.0, 1.0], line.width_left, line.width_right),
+            raceline=racing,
+        )
 
     @cached_property
     def distance_field(self) -> np.ndarray:

@@ -110,9 +110,7 @@ def _try_once(
             while block := response.read1(BLOCK):  # read1: one piece, so that the deadline is looked at
                 size += len(block)
                 if size > max_bytes:
-                    raise OutlapError(
-                        f"{url}: is larger than {max_bytes / 1e6:.0f} MB, the most that is accepted"
-                    )
+                    raise OutlapError(f"{url}: is larger than {max_bytes / 1e6:.0f} MB, the most that is accepted")
                 if time.monotonic() > give_up:
                     raise _TooSlow
                 digest.update(block)

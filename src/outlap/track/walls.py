@@ -43,9 +43,7 @@ def draw_walls(
     reach = float(max(right.max(), left.max()))
 
     low = line.min(axis=0) - reach - margin - resolution
-    width, height = (
-        math.ceil(side / resolution) for side in line.max(axis=0) + reach + margin - low + resolution
-    )
+    width, height = (math.ceil(side / resolution) for side in line.max(axis=0) + reach + margin - low + resolution)
     if width * height > MAX_PIXELS:
         raise OutlapError(
             f"resolution is {resolution}; it makes {width} x {height} pixels and there may be "

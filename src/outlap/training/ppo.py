@@ -24,6 +24,7 @@ class PPOConfig(Config):
     """A PPO training. The defaults learn to lap circuits that they never saw within minutes on two cores."""
 
     env: RaceConfig = RaceConfig(
+        augment_tracks=True,
         beams=108,
         control_interval=4,
         speed_range=(0.0, 8.0),

@@ -56,9 +56,7 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
     _draw_line(map_axes, track)
     _draw_marks(map_axes, track, marks)
     _draw_start(figure, map_axes, track)
-    map_axes.set(
-        xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]", aspect="equal"
-    )
+    map_axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]", aspect="equal")
     figure.legend(handles=_legend(track), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
 
     _draw_curvature(curvature_axes, track, marks)
@@ -118,9 +116,7 @@ def _draw_line(axes: Axes, track: Track) -> None:
     axes.plot(*track.centerline.position(s).T, color=BLUE, linewidth=1.0)
     if track.raceline is not None:
         x, y = track.raceline.x, track.raceline.y
-        axes.plot(
-            np.append(x, x[0]), np.append(y, y[0]), color=VERMILLION, linewidth=1.0, linestyle=RACELINE_DASHES
-        )
+        axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=VERMILLION, linewidth=1.0, linestyle=RACELINE_DASHES)
 
 
 def _draw_marks(axes: Axes, track: Track, marks: np.ndarray) -> None:
@@ -181,9 +177,7 @@ def _legend(track: Track) -> list[Artist]:
         Patch(facecolor=WALL_GREY, label="wall"),
     ]
     if track.raceline is not None:
-        entries.append(
-            Line2D([], [], color=VERMILLION, linewidth=1, linestyle=RACELINE_DASHES, label="racing line")
-        )
+        entries.append(Line2D([], [], color=VERMILLION, linewidth=1, linestyle=RACELINE_DASHES, label="racing line"))
     return entries
 
 
