@@ -18,6 +18,7 @@ from outlap.drivers.centerline_follower import CenterlineFollower
 from outlap.envs.race_env import RaceEnv
 from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
 from outlap.errors import OutlapError
+from outlap.simulator.atlas import FIRST_ROW, ROWS
 
 NAME = "outlap/Race-v0"
 EVERYTHING = ("scan", "pose", "vel", "heading", "previous_action", "frenet", "curvature_ahead")
@@ -216,3 +217,32 @@ def test_gymnasiums_statistics_agree_with_ours(ellipse):
         *_, info = vector.step(np.tile(np.array([0.2, 0.1], np.float32), (3, 1)))
     np.testing.assert_allclose(info["episode"]["r"], info["final_info"]["episode_return"], rtol=1e-6)
     np.testing.assert_array_equal(info["episode"]["l"], 10)
+
+
+def test_real_circuits_by_name(real_tracks, monkeypatch):
+    """As in the README: tracks=["IMS"]. The reference speed is that of the racing line in its file."""
+    monkeypatch.setenv("OUTLAP_TRACKS", str(real_tracks))
+    env = gym.make_vec(
+        NAME,
+        num_envs=8,
+        vectorization_mode="vector_entry_point",
+        tracks=["IMS", "Spielberg"],
+        num_cars=2,
+        beams=108,
+        control_interval=4,
+        reward="paper",
+    )
+    _, info = env.reset(seed=0)
+    assert set(info["track"]) == {"IMS", "Spielberg"}
+    for _ in range(25):
+        observation, _, _, _, info = env.step(np.tile(np.array([0.0, -0.5], np.float32), (8, 1)))
+    assert env.observation_space.contains(observation)
+    race = env.unwrapped.race  # type: ignore[attr-defined]
+    track = race.simulator.tracks[1]
+    first, rows = race.simulator.atlas.index[1, [FIRST_ROW, ROWS]]
+    speeds = race.reference_speed[first : first + rows]
+    slowest = np.argmin(track.raceline.speed)
+    assert speeds.min() == pytest.approx(track.raceline.speed[slowest], abs=0.05)
+    s, _ = track.centerline.to_frenet(track.raceline.x[slowest], track.raceline.y[slowest])
+    assert np.argmin(speeds) * track.centerline.length / rows == pytest.approx(float(s), abs=0.5)
+    assert speeds.max() == pytest.approx(track.raceline.speed.max(), abs=1e-3)

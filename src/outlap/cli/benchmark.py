@@ -75,14 +75,14 @@ class BenchmarkSimulator:
                 with multiprocessing.get_context("spawn").Pool(1) as pool:
                     rows.append(pool.apply(_measure, (self, cars, beams)))
                 update(len(rows), f"{cars} car(s), {beams} beams")
-        import numba
+        from numba import get_num_threads
 
         data = {
             "rows": rows,
             "model": self.model,
             "integrator": self.integrator,
             "timestep_s": 0.01,
-            "threads": numba.config.NUMBA_NUM_THREADS,
+            "threads": get_num_threads(),
             "cores": os.cpu_count(),
             "machine": platform.platform(),
         }

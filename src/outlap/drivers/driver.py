@@ -10,9 +10,18 @@ import numpy as np
 class Driver(Protocol):
     """Decides for a batch of cars. It knows observations, never an environment."""
 
-    name: str
-    observation_terms: tuple[str, ...]  # names of `envs.observations.OBSERVATION_TERMS`
-    scale_observations: bool  # whether terms are to be divided by their scale
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def observation_terms(self) -> tuple[str, ...]:
+        """Names of `envs.observations.OBSERVATION_TERMS`."""
+        ...
+
+    @property
+    def scale_observations(self) -> bool:
+        """Whether terms are to be divided by their scale."""
+        ...
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """Actions in [-1, 1]: (n, 2) steer, speed, from observations (n, size) of n cars."""

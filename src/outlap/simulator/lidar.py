@@ -16,7 +16,7 @@ from statistics import NormalDist
 
 import numpy as np
 from llvmlite import ir
-from numba import carray, njit, types
+from numba import carray, njit, types  # pyright: ignore[reportPrivateImportUsage]
 from numba.extending import intrinsic
 
 from outlap.seeding import hash64
@@ -59,8 +59,8 @@ def beam_directions(beams: int, field_of_view: float) -> tuple[np.ndarray, np.nd
     return np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
 
 
-@intrinsic
-def _lanes(typingctx):
+@intrinsic  # type: ignore[reportArgumentType]
+def _lanes(typingctx=None):
     """Memory for one float32 a lane on the stack, which the compiler turns into vector registers."""
 
     def codegen(context, builder, signature, arguments):

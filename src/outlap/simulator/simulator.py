@@ -103,6 +103,7 @@ class Simulator:
         )
         self._commands = np.zeros((*cars, 2), np.float32)
         self._started = np.zeros(num_worlds, bool)
+        self._called = set()  # kernels that have run
         self.compile_seconds: float | None = None  # of the first call of each kernel, load from cache included
 
     def reset(
@@ -168,12 +169,14 @@ class Simulator:
         self._timed(kernels.step_worlds, self.atlas, self._constants, self.worlds, self._commands, repeats)
 
     def _timed(self, kernel, *arguments) -> None:
-        if kernel.signatures:
+        """Call a kernel; note how long its first call takes, which compiles it or loads it from the cache."""
+        if kernel in self._called:
             kernel(*arguments)
             return
         begin = time.perf_counter()
         kernel(*arguments)
         self.compile_seconds = (self.compile_seconds or 0.0) + time.perf_counter() - begin
+        self._called.add(kernel)
 
 
 def _check(holds: bool, name: str, value: object, remedy: str) -> None:

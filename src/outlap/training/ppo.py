@@ -27,12 +27,12 @@ class PPOConfig(Config):
         augment_tracks=True,
         beams=108,
         control_interval=4,
-        speed_range=(0.0, 8.0),
+        speed_range=(1.0, 8.0),  # a car that may stop would rather stand than enter a corner it does not know
         vehicle=VehicleParams(v_max=8.0),
         observation=("scan", "vel", "heading", "previous_action"),
         scale_observations=True,
         termination=TerminationConfig(time_limit=40.0),
-        start=StartConfig(speed=(0.0, 6.0)),
+        start=StartConfig(speed=(0.0, 6.0), offset=0.8, heading_error=0.3),
     )
     held_out_tracks: tuple[str, ...] = ()  # what `outlap evaluate` takes by default; training never loads them
     total_steps: int = Field(default=2_000_000, gt=0)  # actions, all worlds together
