@@ -104,9 +104,7 @@ def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:
         ("seed: !!python/object/apply:os.getcwd []", "is not valid YAML: could not determine a constructor"),
     ],
 )
-def test_a_mistake_is_one_line_with_file_field_value_and_remedy(
-    tmp_path: Path, text: str, complaint: str
-) -> None:
+def test_a_mistake_is_one_line_with_file_field_value_and_remedy(tmp_path: Path, text: str, complaint: str) -> None:
     path = write(tmp_path, text)
     with pytest.raises(OutlapError) as caught:
         load_config(Race, path)

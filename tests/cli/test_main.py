@@ -65,9 +65,7 @@ def _lap_command(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def outlap(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "outlap", *words], capture_output=True, text=True, check=False
-    )
+    return subprocess.run([sys.executable, "-m", "outlap", *words], capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize(
@@ -137,9 +135,7 @@ def test_json_on_standard_output_stands_alone(capfd: pytest.CaptureFixture[str])
     assert "child process" in err
 
 
-def test_json_to_a_file_leaves_the_table_on_the_screen(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_to_a_file_leaves_the_table_on_the_screen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "lap.json"
     assert cli.main(["test", "lap", "--json", str(path)]) == 0
     assert json.loads(path.read_text())["mu"] == 1.0
@@ -253,9 +249,7 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path, flags: list[str]) -> N
 
 
 @pytest.mark.parametrize("entry", cli.COMMANDS, ids=lambda entry: entry.words)
-def test_every_command_explains_itself_and_takes_json(
-    entry: cli.Entry, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_explains_itself_and_takes_json(entry: cli.Entry, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([*entry.words.split(), "--help"]) == 0
     out, _ = capsys.readouterr()
     assert f"usage: outlap {entry.words}" in out

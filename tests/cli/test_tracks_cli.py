@@ -79,9 +79,7 @@ def test_list_tells_names_sources_splits_and_lengths(run, tmp_path):
     }
     assert {name for name, row in rows.items() if row["split"] == "train"} == set(BUILTIN_TRAIN)
     assert {name for name, row in rows.items() if row["split"] == "held_out"} == set(BUILTIN_HELD_OUT)
-    assert all(
-        row["source"] == "builtin" and row["length_m"] > 0 and row["path"] is None for row in rows.values()
-    )
+    assert all(row["source"] == "builtin" and row["length_m"] > 0 and row["path"] is None for row in rows.values())
 
 
 def test_list_shows_what_is_wrong_with_a_folder_and_goes_on(run, tmp_path, capfd):
@@ -146,10 +144,7 @@ def test_generate_writes_a_track_of_what_was_asked_for(run, tmp_path):
 
 
 def test_generate_in_both_directions_and_with_defaults(run):
-    assert (
-        run("generate", "--seed", "5", "--length", "100", "--anticlockwise", "--name", "left")["clockwise"]
-        is False
-    )
+    assert run("generate", "--seed", "5", "--length", "100", "--anticlockwise", "--name", "left")["clockwise"] is False
     assert Track.load("./left").name == "left"
     assert run("generate", "--seed", "5", "--length", "100")["path"] == "generated-5"
 
@@ -158,9 +153,7 @@ def test_generate_says_what_is_wrong(fail):
     assert "exclude each other" in fail("generate", "--seed", "1", "--clockwise", "--anticlockwise")
     assert "width" in fail("generate", "--seed", "1", "--width", "-1")
     assert "--seed" in fail("generate")
-    assert "name '../x'" in fail(
-        "generate", "--seed", "1", "--length", "100", "--name", "../x", "--out", "here"
-    )
+    assert "name '../x'" in fail("generate", "--seed", "1", "--length", "100", "--name", "../x", "--out", "here")
     assert not Path("here").exists()
     Path("full").mkdir()
     Path("full/letter.txt").write_text("mine")

@@ -153,6 +153,17 @@ def _map(line: Centerline) -> tuple[np.ndarray, float, tuple[float, float, float
     return occupancy, 0.05, origin
 
 
+def test_a_place_too_narrow_for_the_car_is_avoided():
+    """A third of the lap is 20 cm wide: another place is drawn."""
+    angle = np.linspace(0.0, 2.0 * math.pi, 300, endpoint=False)
+    width = np.where(angle < 2.0 * math.pi / 3.0, 0.1, 1.0)
+    line = Centerline.from_points(6.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), width, width)
+    env = RaceVectorEnv(200, tracks=[Track("funnel", *_map(line), line)], beams=0)
+    poses, _ = starts(env, 2)
+    at = np.arctan2(poses[..., 1], poses[..., 0]) % (2.0 * math.pi)
+    assert at.min() > 2.0 * math.pi / 3.0
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [("offset", 1.5), ("offset", -0.1), ("heading_error", -1), ("gap", -1.0), ("gap", (2.0, 1.0)), ("speed", "fast")],

@@ -160,6 +160,28 @@ def test_noise_and_mount_are_drawn_and_reach_the_scan(big_circle, put):
     assert np.corrcoef(scans[..., 265:276].mean(axis=(0, 2)), -mount)[0, 1] > 0.95
 
 
+def test_noise_is_drawn_anew_in_every_scan_car_episode_and_world(ellipse):
+    """What a noisy scanner adds to a true one, from the same starts: no two of them alike."""
+    config = {
+        "tracks": [ellipse],
+        "num_cars": 2,
+        "beams": 60,
+        "observation": "scan",
+        "termination": {"time_limit": 0.03},
+    }
+    true, noisy = RaceVectorEnv(3, **config), RaceVectorEnv(3, **config, lidar={"noise_std": 0.05})
+    true.reset(seed=0)
+    noisy.reset(seed=0)
+    noise = []
+    for _ in range(12):
+        noise.append((noisy.race.worlds.scan - true.race.worlds.scan).reshape(6, 60))
+        true.step(np.zeros((3, 2)))
+        noisy.step(np.zeros((3, 2)))
+    assert noisy.race.worlds.time.max() == 0.0, "the test needs several episodes"
+    correlation = np.corrcoef(np.concatenate(noise))[np.triu_indices(72, 1)]
+    assert np.abs(correlation).max() < 0.7  # 60 beams: 5 sigma
+
+
 def test_a_split_with_a_track_on_both_sides_is_refused(ellipse, circle, big_circle):
     TaskSplit(TaskSet((ellipse, circle)), TaskSet((big_circle,)))
     with pytest.raises(OutlapError, match=r"ring4.*both trained on and held out"):

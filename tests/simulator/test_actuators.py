@@ -138,9 +138,7 @@ def test_no_lag_passes_the_command():
     assert lag(0.2, 0.7, 0.01, 0.0) == 0.7
 
 
-@pytest.mark.parametrize(
-    ("delay", "steps"), [(0.0, 0), (0.004, 0), (0.006, 1), (0.01, 1), (0.07, 7), (0.1, 10)]
-)
+@pytest.mark.parametrize(("delay", "steps"), [(0.0, 0), (0.004, 0), (0.006, 1), (0.01, 1), (0.07, 7), (0.1, 10)])
 def test_delays_are_whole_steps(delay, steps):
     row = parameter_bounds(VehicleParams(), ActuatorParams(steer_delay=delay, speed_delay=2 * delay))[0]
     assert delay_steps(row, 0.01) == (steps, round(2 * delay / 0.01))

@@ -12,14 +12,14 @@ from outlap.simulator.atlas import (
     FIRST_WORD,
     GRID_HEIGHT,
     GRID_WIDTH,
-    LARGEST_CLEARANCE,
-    QUARTER,
+    LINEAR,
+    QUADRATIC,
     RING,
     ROWS,
     SPACING,
     WALL,
     build_atlas,
-    cell,
+    cell_code,
     to_grid,
 )
 from outlap.track.track import Track
@@ -27,9 +27,14 @@ from synthetic_tracks import hall, random_map, ring
 
 
 def unpack(atlas, number: int) -> np.ndarray:
-    """The bytes of a track's grid, the ring included."""
+    """The codes of a track's grid, the ring included."""
     first, width, height = atlas.index[number, [FIRST_WORD, GRID_WIDTH, GRID_HEIGHT]]
-    return np.array([[cell(atlas.words, first, width, col, row) for col in range(width)] for row in range(height)])
+    return np.array([[cell_code(atlas.words, first, width, col, row) for col in range(width)] for row in range(height)])
+
+
+def decoded(code):
+    """The clearance [cells] that a code stands for."""
+    return code * (LINEAR + QUADRATIC * code)
 
 
 def clearance(occupancy: np.ndarray) -> np.ndarray:
@@ -62,9 +67,9 @@ def test_every_cell_of_every_track_is_a_wall_or_says_how_far_a_ray_can_go(tracks
         inner = cells[RING:-RING, RING:-RING]
         np.testing.assert_array_equal(inner == WALL, track.occupancy)
         exact = clearance(track.occupancy)[~track.occupancy]
-        stored = inner[~track.occupancy] * QUARTER
-        assert (stored <= exact).all()  # more, and a ray would pass through a wall
-        assert (stored > exact - QUARTER).all()  # less, and it would only take longer
+        code = inner[~track.occupancy]
+        assert (decoded(code) <= exact).all()  # more, and a ray would pass through a wall
+        assert ((decoded(code + 1) > exact) | (code == WALL - 1)).all()  # less, and it would only take longer
 
 
 def test_a_ring_of_wall_surrounds_every_grid(tracks):
@@ -75,10 +80,10 @@ def test_a_ring_of_wall_surrounds_every_grid(tracks):
         assert (cells[:, [0, -1]] == WALL).all()
 
 
-def test_clearance_that_a_byte_cannot_hold_is_cut():
+def test_clearance_that_four_bits_cannot_hold_is_cut():
     cells = unpack(build_atlas([hall(np.zeros((151, 160), bool))]), 0)
-    assert cells[RING + 75, RING + 80] == LARGEST_CLEARANCE
-    assert cells[RING + 75, RING + 20] == 4 * 20
+    assert cells[RING + 75, RING + 80] == WALL - 1
+    assert decoded(cells[RING + 75, RING + 20]) <= 20 < decoded(cells[RING + 75, RING + 20] + 1)
     assert (cells[RING:-RING, RING:-RING] != WALL).all()
 
 

@@ -95,9 +95,7 @@ def lateral_modes(speed, push, row):
     """Eigenvalues of the (yaw rate, slip) dynamics, by differences (the model is linear in both)."""
 
     def rates(yaw_rate, slip):
-        return np.array(
-            single_track((0.0, 0.0, 0.0, speed, 0.0, yaw_rate, slip, 0.0, 0.0), 0.0, push, row)[5:7]
-        )
+        return np.array(single_track((0.0, 0.0, 0.0, speed, 0.0, yaw_rate, slip, 0.0, 0.0), 0.0, push, row)[5:7])
 
     return np.linalg.eigvals(np.column_stack([rates(1.0, 0.0), rates(0.0, 1.0)]) - rates(0.0, 0.0)[:, None])
 
@@ -106,9 +104,7 @@ changes = st.floats(0.6, 1.6)
 
 
 @settings(deadline=None)
-@given(
-    changes, changes, changes, changes, changes, changes, st.floats(-3.0, 3.0), st.sampled_from([1.0, -1.0])
-)
+@given(changes, changes, changes, changes, changes, changes, st.floats(-3.0, 3.0), st.sampled_from([1.0, -1.0]))
 def test_lateral_rate_is_the_fastest_eigenvalue_at_low_speed(mu, front, rear, lf, mass, inertia, push, way):
     row = small_row()
     row[column.KINEMATIC_SPEED] = 0.1
@@ -140,9 +136,7 @@ def test_the_single_track_is_stable_above_its_kinematic_speed_and_not_far_below(
     assert threshold > 0.5
     assert left_after(threshold) < 1e-3
     loads = axle_loads(0.0, row)
-    rate = lateral_rate(
-        row[column.MU] * row[column.C_SF] * loads[0], row[column.MU] * row[column.C_SR] * loads[1], row
-    )
+    rate = lateral_rate(row[column.MU] * row[column.C_SF] * loads[0], row[column.MU] * row[column.C_SR] * loads[1], row)
     assert left_after(rate * dt / limit * 1.1) < 0.1
     assert left_after(rate * dt / limit * 0.9) > 10.0  # so a bound is needed
 

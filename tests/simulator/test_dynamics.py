@@ -97,9 +97,7 @@ def test_single_track_is_kinematic_at_low_speed_in_both_directions(number, steer
 
 @compiles
 @given(cars, unit, share, unit, unit, unit, unit, unit, st.floats(0.0, 2.0), st.floats(0.0, 2.0))
-def test_drift_derivative_is_the_packages(
-    number, steer, speed, yaw, yaw_rate, slip, rate, push, spin_front, spin_rear
-):
+def test_drift_derivative_is_the_packages(number, steer, speed, yaw, yaw_rate, slip, rate, push, spin_front, spin_rear):
     car = package_car(number)
     row = row_of(car)
     speed = 1.0 + speed * (row[column.V_MAX] - 1.0)
@@ -166,9 +164,7 @@ def solve(rates, state, manoeuvre: Manoeuvre):
     x = np.array(state)
     for duration, rate, push in manoeuvre:
         u = [float(rate), float(push)]
-        x = solve_ivp(lambda _, x, u=u: rates(list(x), u), (0, duration), x, "LSODA", rtol=1e-9, atol=1e-9).y[
-            :, -1
-        ]
+        x = solve_ivp(lambda _, x, u=u: rates(list(x), u), (0, duration), x, "LSODA", rtol=1e-9, atol=1e-9).y[:, -1]
     return x
 
 
@@ -259,9 +255,7 @@ def test_convergence_order(model, integrator, order):
 
 
 @compiles
-@given(
-    st.sampled_from([KINEMATIC, SINGLE_TRACK]), st.sampled_from([EULER, RK4]), unit, share, unit, unit, unit
-)
+@given(st.sampled_from([KINEMATIC, SINGLE_TRACK]), st.sampled_from([EULER, RK4]), unit, share, unit, unit, unit)
 def test_a_mirrored_car_drives_the_mirrored_path(model, integrator, steer, speed, yaw_rate, rate, push):
     row = small_row()
     mirror = np.array([1, -1, -1, 1, -1, -1, -1, 1, 1])

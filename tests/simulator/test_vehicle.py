@@ -27,9 +27,7 @@ def field_order() -> list[str]:
 
 
 def test_columns_follow_the_fields():
-    columns = {
-        name.lower(): number for name, number in vars(column).items() if name.isupper() and name != "PRESETS"
-    }
+    columns = {name.lower(): number for name, number in vars(column).items() if name.isupper() and name != "PRESETS"}
     assert columns.pop("n_params") == len(field_order()) + 1
     assert columns.pop("kinematic_speed") == len(field_order())
     assert columns == {name.lower(): number for number, name in enumerate(field_order())}
@@ -44,9 +42,7 @@ def test_bounds_put_every_value_in_its_own_column():
     def pick(config, **nested):
         return config(**{name: ranges[name] for name in config.model_fields if name in ranges}, **nested)
 
-    low, high = parameter_bounds(
-        pick(VehicleParams, tyre=pick(PacejkaTyre)), pick(ActuatorParams), pick(LidarParams)
-    )
+    low, high = parameter_bounds(pick(VehicleParams, tyre=pick(PacejkaTyre)), pick(ActuatorParams), pick(LidarParams))
     assert low.shape == high.shape == (column.N_PARAMS,)
     assert low.dtype == high.dtype == np.float32
     for number, name in enumerate(field_order()):

@@ -76,9 +76,7 @@ def test_names_that_lead_out_of_the_folder(tmp_path, members, name):
     refused(tmp_path, tar_xz(members | {name: b"evil"}), "leads out|character|too deep")
 
 
-@pytest.mark.parametrize(
-    "kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE]
-)
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE])
 def test_only_plain_files(tmp_path, members, kind):
     special = tarfile.TarInfo("Circle/extra")
     special.type, special.linkname = kind, "../../../../etc/passwd"

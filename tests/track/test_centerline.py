@@ -75,9 +75,7 @@ def test_circle_has_its_length_heading_and_curvature(direction: float) -> None:
     s = np.linspace(-3.0, 50.0, 1001)  # wraps round at both ends
     turned = direction * s / radius
     assert line.length == pytest.approx(2.0 * np.pi * radius, abs=1e-6)
-    np.testing.assert_allclose(
-        line.position(s), radius * np.column_stack([np.cos(turned), np.sin(turned)]), atol=1e-6
-    )
+    np.testing.assert_allclose(line.position(s), radius * np.column_stack([np.cos(turned), np.sin(turned)]), atol=1e-6)
     np.testing.assert_allclose(line.curvature(s), direction / radius, rtol=1e-3)
     heading = line.heading(s)
     assert np.all((heading > -np.pi) & (heading <= np.pi))

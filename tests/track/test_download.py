@@ -198,18 +198,12 @@ def test_offline(cache):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with pytest.raises(
-        UnreachableError, match=r"Monza.*: cannot reach 127.0.0.1:\d+ \(connection refused\)"
-    ) as caught:
-        download_tracks(
-            ["Monza", "Spa"], url_template=f"http://127.0.0.1:{port}/{{name}}.tar.xz", patience=QUICK
-        )
+    with pytest.raises(UnreachableError, match=r"Monza.*: cannot reach 127.0.0.1:\d+ \(connection refused\)") as caught:
+        download_tracks(["Monza", "Spa"], url_template=f"http://127.0.0.1:{port}/{{name}}.tar.xz", patience=QUICK)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "url", ["http://api.f1tenth.org/{name}.tar.xz", "ftp://127.0.0.1/{name}", "file:///{name}"]
-)
+@pytest.mark.parametrize("url", ["http://api.f1tenth.org/{name}.tar.xz", "ftp://127.0.0.1/{name}", "file:///{name}"])
 def test_only_https_is_allowed(url, cache, monkeypatch):
     monkeypatch.setattr(socket, "create_connection", lambda *_, **__: pytest.fail("it connected"))
     with pytest.raises(OutlapError, match="only https is allowed"):
@@ -314,9 +308,7 @@ def test_a_cache_that_cannot_be_written(server, tmp_path):
 # --- the archive --------------------------------------------------------------------------------------------
 
 
-def refused(
-    server: ArchiveServer, cache: Path, body: bytes, match: str, limits: ArchiveLimits | None = None
-) -> None:
+def refused(server: ArchiveServer, cache: Path, body: bytes, match: str, limits: ArchiveLimits | None = None) -> None:
     """The archive is refused, and neither the cache nor anything around it has got a file."""
     server.answers["/Circle.tar.xz"] = body
     with pytest.raises(OutlapError, match=match) as caught:

@@ -89,9 +89,7 @@ def test_a_wall_stands_between_neighbouring_stretches(made):
 def test_starts_on_the_longest_straight_at_the_origin(made):
     track, _ = made
     np.testing.assert_allclose(track.centerline.position(0.0), 0.0, atol=1e-9)
-    nearby = np.linspace(-1, 1, 21) * min(
-        0.45 * max(measure_features(track.centerline).straights, default=0), 10
-    )
+    nearby = np.linspace(-1, 1, 21) * min(0.45 * max(measure_features(track.centerline).straights, default=0), 10)
     np.testing.assert_allclose(track.centerline.curvature(nearby), 0, atol=0.02)
 
 

@@ -171,9 +171,7 @@ def save_as(kind: str, path: Path) -> None:
             big_endian = (grey_patches().astype(np.uint16) * 257).astype(">u2").tobytes()
             path.write_bytes(b"P5\n# a comment\n250 150\n65535\n" + big_endian)
         case "pgm100":
-            path.write_bytes(
-                b"P5 250 150 100\n" + (grey_patches().astype(int) * 100 // 255).astype("u1").tobytes()
-            )
+            path.write_bytes(b"P5 250 150 100\n" + (grey_patches().astype(int) * 100 // 255).astype("u1").tobytes())
         case "png16":
             Image.fromarray(grey_patches().astype(np.uint16) * 257).save(path)
         case "RGB" | "LA" | "RGBA":

@@ -21,9 +21,7 @@ def ring(yaw: float = 0.0, occupancy: np.ndarray | None = None) -> Track:
         occupancy[[0, -1]] = True
         occupancy[:, [0, -1]] = True
     angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
-    line = Centerline.from_points(
-        np.column_stack([4.5 + 3.0 * np.cos(angle), 7.0 + 2.0 * np.sin(angle)]), 1.0, 1.0
-    )
+    line = Centerline.from_points(np.column_stack([4.5 + 3.0 * np.cos(angle), 7.0 + 2.0 * np.sin(angle)]), 1.0, 1.0)
     return Track("ring", occupancy, 0.25, (-3.0, 2.0, yaw), line)
 
 
@@ -114,9 +112,7 @@ def test_bad_fields_are_named(field: str, value: object, message: str) -> None:
         Track(name="ring", centerline=good.centerline, **fields)  # type: ignore[arg-type]
 
 
-def test_load_takes_a_folder_first_and_a_name_otherwise(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_load_takes_a_folder_first_and_a_name_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     catalog = types.ModuleType("outlap.track.catalog")
     catalog.find_track = lambda name: f"track {name}"  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "outlap.track.catalog", catalog)

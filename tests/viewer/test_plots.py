@@ -45,12 +45,7 @@ def test_walls_are_drawn_where_they_are(track, yaw):
     x, y = np.random.default_rng(0).uniform(low, high, size=(4000, 2)).T
     around = [drawn.is_wall(x + dx, y + dy) for dx in (-0.4, 0, 0.4) for dy in (-0.4, 0, 0.4)]
     col, row = drawn.world_to_grid(x, y)
-    inside = (
-        (col > 10)
-        & (row > 10)
-        & (col < track.occupancy.shape[1] - 10)
-        & (row < track.occupancy.shape[0] - 10)
-    )
+    inside = (col > 10) & (row > 10) & (col < track.occupancy.shape[1] - 10) & (row < track.occupancy.shape[0] - 10)
     colours = colours_at(figure, x, y)
     grey = np.all(np.abs(colours - to_rgb(WALL_GREY)) < 0.01, axis=1)
     wall, free = np.all(around, axis=0) & inside, ~np.any(around, axis=0)
@@ -90,9 +85,7 @@ def test_centreline_and_curvature_are_the_tracks_own(track):
 def test_whole_track_is_in_view_and_not_distorted(track):
     axes = draw_track(track).axes[0]
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    edges = track.centerline.to_cartesian(np.linspace(0, 90, 500)[:, None], np.array([-1.1, 1.1])).reshape(
-        -1, 2
-    )
+    edges = track.centerline.to_cartesian(np.linspace(0, 90, 500)[:, None], np.array([-1.1, 1.1])).reshape(-1, 2)
     assert left < edges[:, 0].min() < edges[:, 0].max() < right
     assert bottom < edges[:, 1].min() < edges[:, 1].max() < top
     assert axes.get_aspect() == 1.0

@@ -159,8 +159,7 @@ def reference_speeds(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray
         s = np.arange(rows) * spacing
         if track.raceline is not None:
             at, _ = track.centerline.to_frenet(track.raceline.x, track.raceline.y)
-            order = np.argsort(at)
-            speed = np.interp(s, at[order], track.raceline.speed[order], period=length)
+            speed = np.interp(s, at, track.raceline.speed, period=length)
         else:
             speed = _friction_limited(atlas.line[first : first + rows, CURVATURE], spacing, params)
         out[first : first + rows] = speed

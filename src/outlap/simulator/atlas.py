@@ -1,9 +1,10 @@
 """Tracks, packed into the flat arrays that the kernels read.
 
-Walls and clearance are one byte a cell: 255 in a wall, otherwise how far a ray can safely go from anywhere
-in the cell, in quarters of a cell, rounded down. Four cells, one above the other, make a word: that is what
-processors gather, and a cache line then holds 16 × 4 cells, so that rays in any direction stay in few lines.
-Every grid has a ring of wall cells, so that no ray needs a bounds test.
+Walls and clearance are four bits a cell: 15 in a wall, otherwise a code for how far a ray can safely go from
+anywhere in the cell, rounded down. Eight cells, one above the other, make a word: that is what processors gather.
+A cache line then holds 16 × 8 cells: what the scans of 256 worlds touch nearly fits the caches of two cores, and
+waiting for memory would cost more than the rounding does. Every grid has a ring of wall cells, so that no ray
+needs a bounds test.
 """
 
 from __future__ import annotations
@@ -18,11 +19,10 @@ from numba import njit
 from outlap.track.centerline import TABLE_COLUMNS
 from outlap.track.track import Track
 
-STACK = 4  # cells in a word, one above the other
+STACK = 8  # cells in a word, one above the other
 RING = 1  # wall cells around the grid
-WALL = 255  # byte of a wall cell
-QUARTER = 0.25  # [cells] unit of clearance
-LARGEST_CLEARANCE = 254
+WALL = 15  # code of a wall cell
+LINEAR, QUADRATIC = np.float32(0.33), np.float32(0.11)  # clearance [cells] = code (LINEAR + QUADRATIC code)
 LINE_SPACING = 0.1  # [m] between rows of a centreline's table
 
 # Columns of Atlas.frame
@@ -66,23 +66,24 @@ def build_atlas(tracks: Sequence[Track]) -> Atlas:
 
 def _pack_cells(track: Track) -> np.ndarray:
     """The words of a track's grid, row of words by row of words: uint32 (n,)."""
-    clearance = track.distance_field * np.float32(1.0 / (track.resolution * QUARTER))
-    # A distance in whole cells must not lose a quarter to rounding.
-    code = np.minimum(np.floor(clearance + np.float32(1e-3)), LARGEST_CLEARANCE).astype(np.int16)
+    codes = np.arange(WALL)
+    clearance = track.distance_field / np.float32(track.resolution)
+    code = np.searchsorted(codes * (LINEAR + QUADRATIC * codes), clearance, side="right") - 1
     code[track.occupancy] = WALL
     height, width = code.shape
     down = -(-(height + 2 * RING) // STACK)
-    cells = np.full((down * STACK, width + 2 * RING), WALL, dtype=np.uint8)
+    cells = np.full((down * STACK, width + 2 * RING), WALL, dtype=np.uint32)
     cells[RING : RING + height, RING : RING + width] = code
-    stacks = cells.reshape(down, STACK, -1).transpose(0, 2, 1)
-    return np.ascontiguousarray(stacks).view("<u4").reshape(-1)
+    stacks = cells.reshape(down, STACK, -1)
+    shifts = 4 * np.arange(STACK, dtype=np.uint32)[:, None]
+    return np.bitwise_or.reduce(stacks << shifts, axis=1).reshape(-1)
 
 
 @njit(cache=True)
-def cell(words, first_word, grid_width, col, row):
-    """The byte of a cell; `col` and `row` count the ring and lie in the grid."""
-    word = words[first_word + (row >> 2) * grid_width + col]
-    return (np.int64(word) >> ((row & 3) << 3)) & 255
+def cell_code(words, first_word, grid_width, col, row):
+    """The code of a cell: WALL, or its clearance; `col` and `row` count the ring and lie in the grid."""
+    word = words[first_word + (row >> 3) * grid_width + col]
+    return (np.int64(word) >> ((row & 7) << 2)) & 15
 
 
 @njit(cache=True)

@@ -25,11 +25,12 @@ from outlap.simulator.atlas import (
     FIRST_WORD,
     GRID_HEIGHT,
     GRID_WIDTH,
-    QUARTER,
+    LINEAR,
+    QUADRATIC,
     RESOLUTION,
     SIN,
     WALL,
-    cell,
+    cell_code,
     to_grid,
 )
 from outlap.simulator.vehicle import BIAS, DROPOUT, MAX_RANGE, NOISE_STD
@@ -114,13 +115,13 @@ def cast_walls(atlas, track, x, y, yaw, beam_cos, beam_sin, max_range, ranges_ou
     width = atlas.index[track, GRID_WIDTH]
     height = atlas.index[track, GRID_HEIGHT]
     first_word = atlas.index[track, FIRST_WORD]
-    words = atlas.words[first_word : first_word + width * ((height + 3) >> 2)]
+    words = atlas.words[first_word : first_word + width * ((height + 7) >> 3)]
     pitch = _u4(width)
     col, row = to_grid(atlas.frame, track, x, y)
     x0 = _f4(min(max(col, 0.5), width - 0.5))
     y0 = _f4(min(max(row, 0.5), height - 0.5))
-    here = cell(atlas.words, first_word, width, int(x0), int(y0))
-    clear = _f4(0) if here == WALL else _f4(here) * _f4(QUARTER)  # every beam may begin with this
+    here = cell_code(atlas.words, first_word, width, int(x0), int(y0))
+    clear = _f4(0) if here == WALL else _f4(here) * (LINEAR + QUADRATIC * _f4(here))  # every beam may begin with this
     resolution = _f4(atlas.frame[track, RESOLUTION])
     yaw_in_grid = yaw - math.atan2(atlas.frame[track, SIN], atlas.frame[track, COS])
     cos = _f4(math.cos(yaw_in_grid))
@@ -151,14 +152,15 @@ def cast_walls(atlas, track, x, y, yaw, beam_cos, beam_sin, max_range, ranges_ou
                 i = np.int32(x0 + now * dx[lane + k])
                 j = np.int32(y0 + now * dy[lane + k])
                 v = _u4(j)
-                word = words[_u4(_u4(_u4(_u4(v >> _u4(2)) * pitch) + _u4(i)) & _u4(0x7FFFFFFF))]
-                code = _u4(_u4(word >> _u4(_u4(v & _u4(3)) << _u4(3))) & _u4(255))
+                word = words[_u4(_u4(_u4(_u4(v >> _u4(3)) * pitch) + _u4(i)) & _u4(0x7FFFFFFF))]
+                code = _u4(_u4(word >> _u4(_u4(v & _u4(7)) << _u4(2))) & _u4(15))
                 out_x = _f4(i) * inverse_dx[lane + k] + edge_x[lane + k]
                 out_y = _f4(j) * inverse_dy[lane + k] + edge_y[lane + k]
                 out = out_x if out_x < out_y else out_y
                 out = out if out > now else now
-                free = code != _u4(255)
-                t[lane + k] = out + (_f4(np.int32(code)) * _f4(QUARTER) + OVERSTEP) if free else now
+                free = code != _u4(15)
+                c = _f4(np.int32(code))
+                t[lane + k] = out + (c * (LINEAR + QUADRATIC * c) + OVERSTEP) if free else now
                 marching = _u4(marching + _u4(free))
             if marching == _u4(0):
                 for k in range(min(LANES, beams - first)):

@@ -68,6 +68,7 @@ class Simulator:
         _check(0 <= config.beams <= MAX_BEAMS, "beams", config.beams, f"it must be in [0, {MAX_BEAMS}]")
         _check(0.0 < config.field_of_view <= 2.0 * np.pi, "field_of_view", config.field_of_view,
                "it must be in (0, 2 pi] rad")  # fmt: skip
+        _check(0.0 <= max_delay < np.inf, "max_delay", max_delay, "it must be 0 s or more")
         slots = round(max_delay / config.timestep) + 1
         _check(slots <= MAX_DELAY_STEPS, "max_delay", max_delay, f"at most {MAX_DELAY_STEPS} steps are kept")
         self.config = config
@@ -124,25 +125,31 @@ class Simulator:
             params: (n, cars, N_PARAMS), see `vehicle.parameter_bounds`.
             starts: (n, cars, 4) arc length [m], offset to the left [m], heading error [rad], speed [m/s].
         """
-        which = np.asarray(which, np.int64)
+        which = np.asarray(which)
+        _check(which.ndim == 1 and which.dtype != bool, "which", which, "it must be (n,) indices of worlds")
+        which = which.astype(np.int64)
         n, cars = len(which), self.num_cars
+        keys = np.ascontiguousarray(keys, np.uint64)
         tracks = np.ascontiguousarray(tracks, np.int32)
         params = np.ascontiguousarray(params, np.float32)
         starts = np.ascontiguousarray(starts, np.float64)
+        _check_shape("keys", keys, (n,))
         _check_shape("tracks", tracks, (n,))
         _check_shape("params", params, (n, cars, N_PARAMS))
         _check_shape("starts", starts, (n, cars, 4))
         if n == 0:
             return
         _check(which.min() >= 0 and which.max() < self.num_worlds, "which", which, "no such world")
+        _check(len(np.unique(which)) == n, "which", which, "each world may be named once")
         _check(tracks.min() >= 0 and tracks.max() < len(self.tracks), "tracks", tracks, "no such track")
+        _check(bool(np.isfinite(params).all()), "params", "NaN or infinity", "it must be finite")
         _check(bool(np.isfinite(starts).all()), "starts", "NaN or infinity", "it must be finite")
         slots = self.worlds.delayed.shape[2]
         late = params[..., [STEER_DELAY, SPEED_DELAY]].max() / self.config.timestep
         _check(late < slots - 0.5 + 1e-3, "params", f"a delay of {late:.1f} steps", "raise max_delay")
         self._timed(
             kernels.reset_worlds, self.atlas, self._constants, self.worlds, which,
-            np.ascontiguousarray(keys, np.uint64), tracks, params, starts,
+            keys, tracks, params, starts,
         )  # fmt: skip
         self._started[which] = True
 
@@ -157,6 +164,7 @@ class Simulator:
         """
         commands = np.asarray(commands)
         _check_shape("commands", commands, self._commands.shape)
+        _check(repeats >= 1, "repeats", repeats, "it must be at least 1")
         if not np.isfinite(commands).all():
             world, car, _ = np.argwhere(~np.isfinite(commands))[0]
             raise OutlapError(
