@@ -5,7 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numba
 import pytest
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """A handful of worlds is no work for two threads; tests of threading set a number of their own."""
+    numba.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 
-import numba
 import numpy as np
 import pytest
 
@@ -17,15 +16,6 @@ from outlap.track.walls import draw_walls
 from synthetic_tracks import ring
 
 HALF_WIDTH = 1.1  # [m] of the ellipse
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """A few small worlds are not worth waking other threads, least of all on a busy machine."""
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

@@ -18,10 +18,10 @@ class Demo:
     The same as `outlap train ppo` and `outlap evaluate` with their defaults, but shorter.
     """
 
-    steps: int = 1_500_000
+    steps: int = 1_200_000
     """Actions to train for, all worlds together."""
 
-    episodes: int = 50
+    episodes: int = 30
     """To race on each held-out circuit."""
 
     seed: int = 0

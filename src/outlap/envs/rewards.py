@@ -123,7 +123,8 @@ REWARD_PRESETS: dict[str, dict[str, float]] = {
     # Learns within minutes: progress, and a smooth hand.
     "fast": {
         "progress": 0.1,
-        "collision": 1.0,
+        "collision": 2.0,
+        "stall": 2.0,
         "steering_change": 0.01,
         "speed_change": 0.01,
         "overtake": 1.0,

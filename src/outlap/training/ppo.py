@@ -14,7 +14,7 @@ from pydantic import Field
 from outlap.config import Config
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.terminations import CRASH, TerminationConfig
-from outlap.simulator.vehicle import VehicleParams
+from outlap.simulator.vehicle import LidarParams, VehicleParams
 from outlap.training.run import Run, create_run, save_checkpoint
 
 RECENT_EPISODES = 500  # over which training statistics are taken
@@ -29,6 +29,7 @@ class PPOConfig(Config):
         control_interval=4,
         speed_range=(1.0, 8.0),  # a car that may stop would rather stand than enter a corner it does not know
         vehicle=VehicleParams(v_max=8.0),
+        lidar=LidarParams(noise_std=0.03),
         observation=("scan", "vel", "heading", "previous_action"),
         scale_observations=True,
         termination=TerminationConfig(time_limit=40.0),
@@ -49,7 +50,7 @@ class PPOConfig(Config):
     ent_coef: float = Field(default=0.0, ge=0)
     vf_coef: float = Field(default=0.5, ge=0)
     max_grad_norm: float = Field(default=0.5, gt=0)
-    net_arch: tuple[int, ...] = (256, 256)  # of the policy, and of the value function
+    net_arch: tuple[int, ...] = (128, 128)  # of the policy, and of the value function
     activation: Literal["tanh", "relu"] = "tanh"
     log_std_init: float = -0.5  # log of the initial standard deviation of an action
     device: str = "cpu"
