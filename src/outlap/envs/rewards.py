@@ -123,8 +123,8 @@ REWARD_PRESETS: dict[str, dict[str, float]] = {
     # Learns within minutes: progress, and a smooth hand.
     "fast": {
         "progress": 0.1,
-        "collision": 2.0,
-        "stall": 2.0,
+        "collision": 1.25,
+        "stall": 1.25,
         "steering_change": 0.01,
         "speed_change": 0.01,
         "overtake": 1.0,

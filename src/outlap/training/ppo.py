@@ -29,7 +29,7 @@ class PPOConfig(Config):
         control_interval=4,
         speed_range=(1.0, 8.0),  # a car that may stop would rather stand than enter a corner it does not know
         vehicle=VehicleParams(v_max=8.0),
-        lidar=LidarParams(noise_std=0.03),
+        lidar=LidarParams(noise_std=0.02),
         observation=("scan", "vel", "heading", "previous_action"),
         scale_observations=True,
         termination=TerminationConfig(time_limit=40.0),

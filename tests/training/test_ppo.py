@@ -1,0 +1,145 @@
+"""A training: that it learns, repeats, survives being stopped, and leaves what its folder promises."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+
+from outlap.config import load_config
+from outlap.envs.race_config import RaceConfig
+from outlap.errors import OutlapError
+from outlap.training.ppo import PPOConfig, Progress, train_ppo
+from outlap.training.run import load_run
+from synthetic_tracks import ring
+
+ENV = RaceConfig(
+    tracks=("ring5",),
+    beams=16,
+    control_interval=5,
+    speed_range=(0.0, 3.0),
+    observation=("scan", "vel", "frenet"),
+    scale_observations=True,
+    termination={"time_limit": 8.0},  # type: ignore[arg-type]
+)
+SMALL = PPOConfig(
+    env=ENV, total_steps=512, num_envs=8, n_steps=16, batch_size=64, n_epochs=2, net_arch=(16,), checkpoint_every=128
+)
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A current folder of its own, from which the ring has a name; one torch thread."""
+    ring(radius=5.0).save(tmp_path / "maps" / "ring5")
+    monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
+    monkeypatch.chdir(tmp_path)
+    torch.set_num_threads(1)
+
+
+def weights(path: Path) -> np.ndarray:
+    model = PPO.load(path, device="cpu")
+    return np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()])
+
+
+def test_a_run_folder_holds_what_repeats_it() -> None:
+    reports: list[Progress] = []
+    run = train_ppo(SMALL, Path("run"), on_progress=reports.append)
+    assert load_config(PPOConfig, run.folder / "config.yaml") == SMALL
+    record = json.loads((run.folder / "run.json").read_text())
+    assert (record["finished"], record["steps"], record["seed"]) == (True, 512, 0)
+    assert record["versions"]["torch"] == torch.__version__
+    assert run.policy_path == run.folder / "policy.zip"
+    assert list((run.folder / "tensorboard").glob("events.*"))
+    assert [report.steps for report in reports] == [128, 256, 384, 512]
+    assert len(run.checkpoints()) == 3  # of four, the newest three
+    assert not list(run.folder.rglob("*.partial*"))
+
+
+def test_the_same_seed_gives_the_same_policy_and_another_one_does_not() -> None:
+    first, second = (train_ppo(SMALL, Path(name)) for name in ("a", "b"))
+    np.testing.assert_array_equal(weights(first.policy_path), weights(second.policy_path))
+    third = train_ppo(SMALL.model_copy(update={"seed": 1}), Path("c"))
+    assert not np.array_equal(weights(first.policy_path), weights(third.policy_path))
+
+
+def stopped_after(steps: int, folder: Path) -> None:
+    """A training that Ctrl-C ends."""
+
+    def stop(progress: Progress) -> None:
+        if progress.steps >= steps:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_ppo(SMALL, folder, on_progress=stop)
+
+
+def test_a_stopped_run_goes_on_where_it_was() -> None:
+    stopped_after(256, Path("run"))
+    run = load_run("run")
+    assert run.policy_path.name == "step_000000256.zip"
+    reports: list[Progress] = []
+    train_ppo(run.config, run.folder, resume=run, on_progress=reports.append)
+    assert [report.steps for report in reports] == [384, 512]
+    model = PPO.load(run.folder / "policy.zip", device="cpu")
+    assert model.num_timesteps == 512
+    # Over which the learning rate falls: the whole training, not what was left of it.
+    assert model._total_timesteps == 512
+
+
+def test_a_broken_checkpoint_gives_way_to_the_one_before() -> None:
+    stopped_after(384, Path("run"))
+    run = load_run("run")
+    newest = run.checkpoints()[0]
+    newest.write_bytes(newest.read_bytes()[:1000])
+    reports: list[Progress] = []
+    train_ppo(run.config, run.folder, resume=run, on_progress=reports.append)
+    assert reports[0].steps == 384
+    assert newest.name in json.dumps(json.loads((run.folder / "run.json").read_text()))
+
+
+def test_a_finished_run_is_not_trained_further() -> None:
+    run = train_ppo(SMALL, Path("run"))
+    before = weights(run.policy_path)
+    train_ppo(run.config, run.folder, resume=load_run("run"))
+    np.testing.assert_array_equal(weights(run.policy_path), before)
+
+
+def test_curricula_go_on_from_where_the_run_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped_after(256, Path("run"))
+    seen: list[int] = []
+    run = load_run("run")
+    from outlap.envs.race_vector_env import RaceVectorEnv
+
+    monkeypatch.setattr(
+        RaceVectorEnv, "training_steps", property(lambda env: 0, lambda env, steps: seen.append(int(steps)))
+    )
+    train_ppo(run.config, run.folder, resume=run)
+    assert seen == [256]
+
+
+def test_nothing_is_overwritten_and_mistakes_leave_no_folder() -> None:
+    train_ppo(SMALL, Path("run"))
+    with pytest.raises(OutlapError, match="holds a run already"):
+        train_ppo(SMALL, Path("run"))
+    with pytest.raises(OutlapError, match="no track is called 'nowhere'"):
+        train_ppo(SMALL.model_copy(update={"env": ENV.model_copy(update={"tracks": ("nowhere",)})}), Path("other"))
+    assert not Path("other").exists()
+    with pytest.raises(OutlapError, match="is not a run folder"):
+        load_run("other")
+
+
+def test_it_learns_to_drive_round_a_ring() -> None:
+    config = SMALL.model_copy(
+        update={"total_steps": 24_000, "num_envs": 16, "n_steps": 32, "batch_size": 128, "n_epochs": 5,
+                "learning_rate": 1e-3, "checkpoint_every": 10**9}
+    )  # fmt: skip
+    reports: list[Progress] = []
+    train_ppo(config, Path("run"), on_progress=reports.append)
+    begin, end = reports[2].progress_m, reports[-1].progress_m
+    assert begin is not None
+    assert end is not None
+    assert end > 2.0 * begin  # metres before the episode ends
