@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from outlap.cli.output import CommandResult
+from outlap.config import bounds
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class Evaluate:
     """[s] of an episode; by default enough for one lap more than --laps at 1 m/s."""
 
     v_max: float | None = None
-    """[m/s] top speed of the cars, in place of the run's."""
+    """[m/s] top speed of the cars, in place of the run's; what the policy commands stays within what it learnt."""
 
     seed: int = 0
     """Of the episodes."""
@@ -305,9 +306,14 @@ def _held_out(run: Run | None) -> tuple[str, ...]:
 
 
 def _with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
+    """The task with another top speed of the cars; actions go on to mean the speeds that they were trained with."""
     if v_max is None:
         return env
-    return env.model_copy(update={"vehicle": env.vehicle.model_copy(update={"v_max": v_max})})
+    vehicle = env.vehicle.model_copy(update={"v_max": v_max})
+    speeds = env.speed_range or (bounds(env.vehicle.v_min)[0], None)
+    if speeds[1] is None:
+        speeds = (speeds[0], bounds(env.vehicle.v_max)[1])
+    return env.model_copy(update={"vehicle": vehicle, "speed_range": speeds})
 
 
 def _trained_on(run: Run | None, tracks: Sequence[str]) -> list[str]:

@@ -13,6 +13,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
+from outlap.errors import OutlapError
 from outlap.training.ppo import PPOConfig, Progress, train_ppo
 from outlap.training.run import Run, load_run
 
@@ -53,6 +54,8 @@ class TrainPPO:
         return cls(settings=load_config(PPOConfig, path))
 
     def run(self) -> CommandResult:
+        if self.resume and (self.out or self.config or self.settings != PPOConfig()):
+            raise OutlapError("--resume goes on with the run's own configuration and folder; leave the other flags out")
         resumed = load_run(self.resume) if self.resume else None
         config = resumed.config if resumed else self.settings
         folder = resumed.folder if resumed else self.out or Path("runs") / time.strftime("ppo-%Y%m%d-%H%M%S")

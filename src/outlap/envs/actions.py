@@ -7,7 +7,7 @@ import numpy as np
 from outlap.simulator.vehicle import STEER_MAX, STEER_MIN, V_MAX, V_MIN
 
 
-def commands(actions: np.ndarray, params: np.ndarray, speed_range: tuple[float, float] | None) -> np.ndarray:
+def commands(actions: np.ndarray, params: np.ndarray, speed_range: tuple[float, float | None] | None) -> np.ndarray:
     """Steering angles [rad] and speeds [m/s] of normalised actions.
 
     ±1 in the first column is the left / right stop, 0 is straight ahead; -1 … 1 in the second spans the speed
@@ -16,7 +16,7 @@ def commands(actions: np.ndarray, params: np.ndarray, speed_range: tuple[float, 
     Args:
         actions: (..., 2) in [-1, 1]: steer (left positive), speed.
         params: (..., N_PARAMS) of the cars.
-        speed_range: speeds that -1 and 1 stand for [m/s]; None takes each car's own v_min and v_max.
+        speed_range: speeds that -1 and 1 stand for [m/s]; None: each car's v_min and v_max; (low, None): its v_max.
 
     Returns:
         float32 (..., 2).
@@ -24,6 +24,7 @@ def commands(actions: np.ndarray, params: np.ndarray, speed_range: tuple[float, 
     steer, speed = actions[..., 0], actions[..., 1]
     out = np.empty(actions.shape, np.float32)
     out[..., 0] = np.where(steer >= 0.0, steer * params[..., STEER_MAX], -steer * params[..., STEER_MIN])
-    low, high = speed_range if speed_range else (params[..., V_MIN], params[..., V_MAX])
+    low, high = speed_range or (params[..., V_MIN], None)
+    high = params[..., V_MAX] if high is None else high
     out[..., 1] = low + 0.5 * (speed + 1.0) * (high - low)
     return out

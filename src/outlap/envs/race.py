@@ -32,7 +32,7 @@ class Race:
     distance_before: np.ndarray = field(init=False)  # (worlds,) one step ago [m]
     farthest: np.ndarray = field(init=False)  # (worlds,) unwrapped distance reached so far [m]
     farthest_before: np.ndarray = field(init=False)  # one step ago [m]
-    farthest_time: np.ndarray = field(init=False)  # when that last grew by STALL_DISTANCE or more [s]
+    farthest_time: np.ndarray = field(init=False)  # when that last grew by the stall distance [s]
     stall_mark: np.ndarray = field(init=False)  # (worlds,) distance at that time [m]
     stalled: np.ndarray = field(init=False)  # bool (worlds,): this step ended the episode for want of progress
     ahead: np.ndarray = field(init=False)  # (worlds, cars) whether the ego is ahead of each car

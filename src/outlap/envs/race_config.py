@@ -45,8 +45,8 @@ class RaceConfig(SimulatorConfig):
     augment_tracks: bool = False  # race each track also the other way round, mirrored, and both
     num_cars: int = Field(default=1, ge=1, le=64)  # the ego and its opponents
     opponent_speed: Annotated[Number, bounded(at_least=0)] = 3.0  # their top speed, drawn per opponent [m/s]
-    control_interval: int = Field(default=1, ge=1, le=1000)  # physics steps per action
-    speed_range: tuple[float, float] | None = None  # [m/s] of the action's second number; None: v_min, v_max
+    control_interval: int = Field(default=1, ge=1, le=100)  # physics steps per action
+    speed_range: tuple[float, float | None] | None = None  # [m/s] commanded by -1, 1; None: v_min, v_max
     vehicle: Annotated[VehicleParams, BeforeValidator(_vehicle_preset)] = VehicleParams()
     actuators: ActuatorParams = ActuatorParams()
     lidar: LidarParams = LidarParams()
@@ -75,7 +75,7 @@ class RaceConfig(SimulatorConfig):
 
     @field_validator("speed_range")
     @classmethod
-    def _ordered(cls, speeds: tuple[float, float] | None) -> tuple[float, float] | None:
-        if speeds is not None and not speeds[0] < speeds[1]:
+    def _ordered(cls, speeds: tuple[float, float | None] | None) -> tuple[float, float | None] | None:
+        if speeds is not None and speeds[1] is not None and not speeds[0] < speeds[1]:
             raise ValueError("must be (slowest, fastest) [m/s] with slowest < fastest")
         return speeds

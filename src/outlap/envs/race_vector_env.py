@@ -234,7 +234,9 @@ class RaceVectorEnv(VectorEnv):
                 break
         else:
             name = self._names[tracks[waiting[0]]]
-            raise OutlapError(f"track {name}: found no start free of contact; is it as wide as the car?")
+            raise OutlapError(
+                f"track {name}: found no start free of contact; is it as wide as a car, and long enough for all?"
+            )
         self.race.begin(which)
         self._over[which] = False
         for total in self._totals.values():

@@ -34,7 +34,7 @@ FIRST_WORD, GRID_WIDTH, GRID_HEIGHT, FIRST_ROW, ROWS = range(5)
 class Atlas(NamedTuple):
     """All tracks of a simulator."""
 
-    words: np.ndarray  # uint32: the cells of all grids, four a word
+    words: np.ndarray  # uint32: the codes of all grids' cells, eight a word
     line: np.ndarray  # float32 (rows, TABLE_COLUMNS): the centreline tables of all tracks
     index: np.ndarray  # int64 (tracks, 5): where each track lies in the two above
     frame: np.ndarray  # float64 (tracks, 6): grid origin [m] and yaw, cell size and row spacing [m]

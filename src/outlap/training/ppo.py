@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from pydantic import Field
 
 from outlap.config import Config
 from outlap.envs.race_config import RaceConfig, StartConfig
+from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
 from outlap.envs.terminations import CRASH, TerminationConfig
 from outlap.simulator.vehicle import LidarParams, VehicleParams
 from outlap.training.run import Run, create_run, save_checkpoint
@@ -27,7 +29,7 @@ class PPOConfig(Config):
         augment_tracks=True,
         beams=108,
         control_interval=4,
-        speed_range=(1.0, 8.0),  # a car that may stop would rather stand than enter a corner it does not know
+        speed_range=(1.0, None),  # a car that may stop would rather stand than enter a corner it does not know
         vehicle=VehicleParams(v_max=8.0),
         lidar=LidarParams(noise_std=0.02),
         observation=("scan", "vel", "heading", "previous_action"),
@@ -35,7 +37,7 @@ class PPOConfig(Config):
         termination=TerminationConfig(time_limit=40.0),
         start=StartConfig(speed=(0.0, 6.0), offset=0.8, heading_error=0.3),
     )
-    held_out_tracks: tuple[str, ...] = ()  # what `outlap evaluate` takes by default; training never loads them
+    held_out_tracks: tuple[str, ...] = ()  # what `outlap evaluate` takes by default; refused if also trained on
     total_steps: int = Field(default=2_000_000, gt=0)  # actions, all worlds together
     num_envs: int = Field(default=128, ge=1)
     seed: int = Field(default=0, ge=0)
@@ -58,7 +60,8 @@ class PPOConfig(Config):
     checkpoint_every: int = Field(default=250_000, gt=0)  # actions
 
 
-class Progress(Config):
+@dataclass(frozen=True)
+class Progress:
     """How a training stands, for whoever shows it."""
 
     steps: int
@@ -81,12 +84,14 @@ def train_ppo(
     Args:
         config: what to train.
         folder: where; must not hold a run, unless it is `resume`'s.
-        resume: a run to continue from its newest checkpoint.
+        resume: a run to continue from its newest checkpoint; one that is finished is handed back.
         on_progress: called after every rollout.
 
     Raises OutlapError for a track that cannot be loaded, a folder that holds a run. A KeyboardInterrupt
     passes through once a checkpoint is written.
     """
+    if resume is not None and resume.finished:
+        return resume
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.logger import configure
@@ -97,7 +102,11 @@ def train_ppo(
         torch.set_num_threads(config.threads)
     # Everything that can be wrong with the configuration is found here, before the folder is made.
     environment = SB3VecEnv(config.num_envs, **dict(config.env))
+    if config.held_out_tracks:
+        TaskSplit(environment.env.tasks, TaskSet(load_tracks(config.held_out_tracks)))
     run = resume or create_run(folder, config)
+    if resume:
+        run.begin_session()
     model = _newest_model(run, environment, config) if resume else None
     if model is None:
         model = PPO(
@@ -188,6 +197,12 @@ def _watcher(run: Run, config: PPOConfig, on_progress: Callable[[Progress], None
             self.episodes.extend(info for info in self.locals["infos"] if "episode" in info)
             return True
 
+        def _on_rollout_start(self) -> None:
+            # Here, and not where a rollout ends: by now the policy has learnt from all that it has seen.
+            if self.model.num_timesteps - self.saved_at >= config.checkpoint_every:
+                save_checkpoint(run, self.model, _checkpoint_name(self.model))
+                self.saved_at = self.model.num_timesteps
+
         def _on_rollout_end(self) -> None:
             numbers = {
                 name: float(np.mean([episode[name] for episode in self.episodes]))
@@ -207,9 +222,6 @@ def _watcher(run: Run, config: PPOConfig, on_progress: Callable[[Progress], None
                 crash_rate = float(np.mean([episode["outcome"] == CRASH for episode in self.episodes]))
                 self.logger.record("race/crash_rate", crash_rate)
             steps = self.model.num_timesteps
-            if steps - self.saved_at >= config.checkpoint_every:
-                save_checkpoint(run, self.model, _checkpoint_name(self.model))
-                self.saved_at = steps
             if on_progress is not None:
                 on_progress(
                     Progress(

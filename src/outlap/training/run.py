@@ -53,11 +53,23 @@ class Run:
         found = (self.folder / "checkpoints").glob("step_*.zip")
         return sorted((p for p in found if re.fullmatch(r"step_\d+", p.stem)), key=_steps_of, reverse=True)
 
+    @property
+    def finished(self) -> bool:
+        """Whether the training came to its end."""
+        return bool(self._record().get("finished"))
+
+    def begin_session(self) -> None:
+        """Note in run.json that the training goes on, by which command and where."""
+        self.write_record(resumed=[*self._record().get("resumed", []), provenance()])
+
+    def _record(self) -> dict[str, Any]:
+        path = self.folder / "run.json"
+        return json.loads(path.read_text()) if path.exists() else {}
+
     def write_record(self, **facts: Any) -> None:
         """Add facts to run.json."""
-        path = self.folder / "run.json"
-        record = json.loads(path.read_text()) if path.exists() else {}
-        atomic_write(path, json.dumps({**record, **facts}, indent=2, default=str) + "\n")
+        text = json.dumps({**self._record(), **facts}, indent=2, default=str) + "\n"
+        atomic_write(self.folder / "run.json", text)
 
 
 def create_run(folder: Path, config: PPOConfig) -> Run:
