@@ -25,7 +25,10 @@ def _probe():  # its cache is where the cache of this folder's functions is
 
 def discard_stale_kernels() -> None:
     """Delete this folder's compiled functions unless they are of today's sources. Call before the first is used."""
-    folder = Path(_probe.stats.cache_path)
+    path = _probe.stats.cache_path
+    if path is None:  # caching is switched off
+        return
+    folder = Path(path)
     sources = [
         *sorted((PACKAGE / "simulator").glob("*.py")),
         PACKAGE / "seeding.py",
