@@ -224,9 +224,16 @@ def _process(tmp_path: Path, body: str) -> list[str]:
     return [sys.executable, str(program), "work"]
 
 
+def _heed_ctrl_c() -> None:
+    """A test run in the background hands down an ignored SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_ctrl_c_ends_the_process_with_130_and_one_line(tmp_path: Path) -> None:
     command = _process(tmp_path, "print('ready', flush=True); time.sleep(60)")
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_heed_ctrl_c
+    ) as process:
         assert process.stdout is not None
         process.stdout.readline()
         process.send_signal(signal.SIGINT)

@@ -58,11 +58,13 @@ def test_a_configuration_file_is_overridden_by_flags(here: Path) -> None:
         (["--no-such-flag"], "no-such-flag"),
         (["--env.tracks", "nowhere"], "no track is called 'nowhere'"),
         (["--resume", "nowhere"], "is not a run folder"),
+        (["--resume", "nowhere", "--seed", "3"], "leave the other flags out"),
         (["--config", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(words: list[str], said: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "ppo", *words, "--out", "run"]) == 2
+    out_folder = [] if "--resume" in words else ["--out", "run"]
+    assert main(["train", "ppo", *words, *out_folder]) == 2
     out, err = capfd.readouterr()
     assert (out, len(err.splitlines())) == ("", 1)
     assert said in err
@@ -71,12 +73,22 @@ def test_a_mistake_is_one_line_and_exit_code_2(words: list[str], said: str, capf
 
 def test_ctrl_c_keeps_the_work_and_says_how_to_go_on(here: Path) -> None:
     command = [sys.executable, "-m", "outlap", "train", "ppo", *SMALL, "--total-steps", "100000000", "--out", "run"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, "NUMBA_NUM_THREADS": "1"})
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "NUMBA_NUM_THREADS": "1"},
+        # A test run in the background hands down an ignored SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 240.0  # the kernels may have to be compiled first
     while not list((here / "run" / "checkpoints").glob("step_*.zip")) and time.monotonic() < deadline:
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    try:
+        _, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert "outlap train ppo --resume run" in err
     assert "Traceback" not in err
