@@ -178,7 +178,8 @@ def test_drawn_parameters_name_the_right_columns():
 
 
 def test_rewards_are_those_at_the_end_of_every_curriculum():
-    reward = RewardConfig(weights={"progress": 0.0, "steering_change": 0.0, "speed_change": 0.0}, collision_max=7.0)
+    weights = {"progress": 0.0, "collision": 1.0, "steering_change": 0.0, "speed_change": 0.0}
+    reward = RewardConfig(weights=weights, collision_max=7.0)
     task = SLIPPERY.model_copy(update={"reward": reward})
     rows = evaluate(follower(), task, [LARGE], episodes=6, seed=5, num_worlds=3)
     assert set(rows["outcome"]) >= {"crash", "finished"}

@@ -164,9 +164,9 @@ def test_a_step_allocates_nothing():
         kept, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    # What the Python call itself needs. One state is 4.6 kB, one scan of all is 20 kB, a leak would come 100 times.
-    assert kept < 2048
-    assert peak < 4096
+    # What the Python call itself needs. A leak would come 100 times: even one of an empty list would make 5.6 kB.
+    assert kept < 5000
+    assert peak < 5000
 
 
 def test_a_step_changes_the_same_arrays():
