@@ -1,10 +1,10 @@
 """Tracks, packed into the flat arrays that the kernels read.
 
-Walls and clearance are four bits a cell: 15 in a wall, otherwise a code for how far a ray can safely go from
-anywhere in the cell, rounded down. Eight cells, one above the other, make a word: that is what processors gather.
-A cache line then holds 16 × 8 cells: what the scans of 256 worlds touch nearly fits the caches of two cores, and
-waiting for memory would cost more than the rounding does. Every grid has a ring of wall cells, so that no ray
-needs a bounds test.
+Walls and clearance are four bits a cell: 15 in a wall, otherwise how many cells a ray can safely go from anywhere
+in the cell, rounded down and 14 at most. Eight cells, one above the other, make a word: that is what processors
+gather. A cache line then holds 16 × 8 cells: what the scans of 256 worlds touch nearly fits the caches of two
+cores, and waiting for memory would cost more than the rounding does. Every grid has a ring of wall cells, so that
+no ray needs a bounds test.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from outlap.track.track import Track
 
 STACK = 8  # cells in a word, one above the other
 RING = 1  # wall cells around the grid
-WALL = 15  # code of a wall cell
-LINEAR, QUADRATIC = np.float32(0.33), np.float32(0.11)  # clearance [cells] = code (LINEAR + QUADRATIC code)
+WALL = 15  # in place of a wall cell's clearance
+ROUNDING = np.float32(1e-4)  # [cells] that a whole clearance may lack for float32's sake
 LINE_SPACING = 0.1  # [m] between rows of a centreline's table
 
 # Columns of Atlas.frame
@@ -34,7 +34,7 @@ FIRST_WORD, GRID_WIDTH, GRID_HEIGHT, FIRST_ROW, ROWS = range(5)
 class Atlas(NamedTuple):
     """All tracks of a simulator."""
 
-    words: np.ndarray  # uint32: the codes of all grids' cells, eight a word
+    words: np.ndarray  # uint32: WALL or clearance of all grids' cells, eight a word
     line: np.ndarray  # float32 (rows, TABLE_COLUMNS): the centreline tables of all tracks
     index: np.ndarray  # int64 (tracks, 5): where each track lies in the two above
     frame: np.ndarray  # float64 (tracks, 6): grid origin [m] and yaw, cell size and row spacing [m]
@@ -66,22 +66,20 @@ def build_atlas(tracks: Sequence[Track]) -> Atlas:
 
 def _pack_cells(track: Track) -> np.ndarray:
     """The words of a track's grid, row of words by row of words: uint32 (n,)."""
-    codes = np.arange(WALL)
-    clearance = track.distance_field / np.float32(track.resolution)
-    code = np.searchsorted(codes * (LINEAR + QUADRATIC * codes), clearance, side="right") - 1
-    code[track.occupancy] = WALL
-    height, width = code.shape
+    clearance = np.minimum(track.distance_field / np.float32(track.resolution) + ROUNDING, WALL - 1)
+    clearance = np.where(track.occupancy, WALL, clearance.astype(np.int32))
+    height, width = clearance.shape
     down = -(-(height + 2 * RING) // STACK)
     cells = np.full((down * STACK, width + 2 * RING), WALL, dtype=np.uint32)
-    cells[RING : RING + height, RING : RING + width] = code
+    cells[RING : RING + height, RING : RING + width] = clearance
     stacks = cells.reshape(down, STACK, -1)
     shifts = 4 * np.arange(STACK, dtype=np.uint32)[:, None]
     return np.bitwise_or.reduce(stacks << shifts, axis=1).reshape(-1)
 
 
 @njit(cache=True)
-def cell_code(words, first_word, grid_width, col, row):
-    """The code of a cell: WALL, or its clearance; `col` and `row` count the ring and lie in the grid."""
+def cell_clearance(words, first_word, grid_width, col, row):
+    """The clearance of a cell [cells], or WALL; `col` and `row` count the ring and lie in the grid."""
     word = words[first_word + (row >> 3) * grid_width + col]
     return (np.int64(word) >> ((row & 7) << 2)) & 15
 

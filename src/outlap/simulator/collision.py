@@ -11,12 +11,10 @@ from outlap.simulator.atlas import (
     FIRST_WORD,
     GRID_HEIGHT,
     GRID_WIDTH,
-    LINEAR,
-    QUADRATIC,
     RESOLUTION,
     SIN,
     WALL,
-    cell_code,
+    cell_clearance,
     to_grid,
 )
 
@@ -40,8 +38,8 @@ def touches_wall(atlas, track, x, y, yaw, half_length, half_width):
     per_metre = 1.0 / atlas.frame[track, RESOLUTION]
     a = half_length * per_metre
     b = half_width * per_metre
-    code = cell_code(atlas.words, index[FIRST_WORD], width, int(col), int(row))
-    if code != WALL and code * (LINEAR + QUADRATIC * code) > math.sqrt(a * a + b * b):
+    clearance = cell_clearance(atlas.words, index[FIRST_WORD], width, int(col), int(row))
+    if clearance != WALL and clearance * clearance > a * a + b * b:
         return False
 
     cos_yaw = math.cos(yaw)
@@ -64,7 +62,7 @@ def touches_wall(atlas, track, x, y, yaw, half_length, half_width):
             dx = i + 0.5 - col
             if abs(cos * dx + sin * dy) >= along or abs(cos * dy - sin * dx) >= across:
                 continue
-            if cell_code(atlas.words, index[FIRST_WORD], width, i, j) == WALL:
+            if cell_clearance(atlas.words, index[FIRST_WORD], width, i, j) == WALL:
                 return True
     return False
 

@@ -25,12 +25,10 @@ from outlap.simulator.atlas import (
     FIRST_WORD,
     GRID_HEIGHT,
     GRID_WIDTH,
-    LINEAR,
-    QUADRATIC,
     RESOLUTION,
     SIN,
     WALL,
-    cell_code,
+    cell_clearance,
     to_grid,
 )
 from outlap.simulator.vehicle import BIAS, DROPOUT, MAX_RANGE, NOISE_STD
@@ -40,7 +38,7 @@ SLOTS = 4
 OVERSTEP = np.float32(2e-3)  # [cells] past a cell's edge, so that rounding leaves no ray on it
 STEEPEST = np.float32(1e-5)  # least slope [rad] of a ray to the grid, so that crossings stay within float32
 FASTMATH = {"nnan", "ninf", "nsz", "contract"}
-_f4, _u4 = np.float32, np.uint32
+_f4, _u4, _u8 = np.float32, np.uint32, np.uint64
 
 QUANTILES = 4096
 _probability = (np.arange(QUANTILES) + 0.5) / QUANTILES
@@ -80,8 +78,9 @@ def _aim(lane, first, clear, x0, y0, cos, sin, beam_cos, beam_sin, t, dx, dy, in
         return
     for k in range(LANES):
         t[lane + k] = clear
-        a = cos * beam_cos[first + k] - sin * beam_sin[first + k]
-        b = sin * beam_cos[first + k] + cos * beam_sin[first + k]
+        n = _u8(first + k)
+        a = cos * beam_cos[n] - sin * beam_sin[n]
+        b = sin * beam_cos[n] + cos * beam_sin[n]
         a = STEEPEST if abs(a) < STEEPEST else a
         b = STEEPEST if abs(b) < STEEPEST else b
         dx[lane + k] = a
@@ -120,8 +119,8 @@ def cast_walls(atlas, track, x, y, yaw, beam_cos, beam_sin, max_range, ranges_ou
     col, row = to_grid(atlas.frame, track, x, y)
     x0 = _f4(min(max(col, 0.5), width - 0.5))
     y0 = _f4(min(max(row, 0.5), height - 0.5))
-    here = cell_code(atlas.words, first_word, width, int(x0), int(y0))
-    clear = _f4(0) if here == WALL else _f4(here) * (LINEAR + QUADRATIC * _f4(here))  # every beam may begin with this
+    here = cell_clearance(atlas.words, first_word, width, int(x0), int(y0))
+    clear = _f4(0 if here == WALL else here)  # every beam may begin with this
     resolution = _f4(atlas.frame[track, RESOLUTION])
     yaw_in_grid = yaw - math.atan2(atlas.frame[track, SIN], atlas.frame[track, COS])
     cos = _f4(math.cos(yaw_in_grid))
@@ -153,19 +152,21 @@ def cast_walls(atlas, track, x, y, yaw, beam_cos, beam_sin, max_range, ranges_ou
                 j = np.int32(y0 + now * dy[lane + k])
                 v = _u4(j)
                 word = words[_u4(_u4(_u4(_u4(v >> _u4(3)) * pitch) + _u4(i)) & _u4(0x7FFFFFFF))]
-                code = _u4(_u4(word >> _u4(_u4(v & _u4(7)) << _u4(2))) & _u4(15))
+                clearance = _u4(_u4(word >> _u4(_u4(v & _u4(7)) << _u4(2))) & _u4(15))
                 out_x = _f4(i) * inverse_dx[lane + k] + edge_x[lane + k]
                 out_y = _f4(j) * inverse_dy[lane + k] + edge_y[lane + k]
                 out = out_x if out_x < out_y else out_y
                 out = out if out > now else now
-                free = code != _u4(15)
-                c = _f4(np.int32(code))
-                t[lane + k] = out + (c * (LINEAR + QUADRATIC * c) + OVERSTEP) if free else now
+                free = clearance != _u4(15)
+                t[lane + k] = out + (_f4(np.int32(clearance)) + OVERSTEP) if free else now
                 marching = _u4(marching + _u4(free))
             if marching == _u4(0):
-                for k in range(min(LANES, beams - first)):
-                    reached = t[lane + k] * resolution
-                    ranges_out[first + k] = reached if reached < max_range else max_range
+                if first + LANES <= beams:
+                    for k in range(LANES):
+                        ranges_out[_u8(first + k)] = min(t[lane + k] * resolution, max_range)
+                else:
+                    for k in range(beams - first):
+                        ranges_out[_u8(first + k)] = min(t[lane + k] * resolution, max_range)
                 beam[slot] = waiting
                 _aim(
                     lane, waiting, clear, x0, y0, cos, sin, beam_cos, beam_sin,
