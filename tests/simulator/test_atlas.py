@@ -12,14 +12,12 @@ from outlap.simulator.atlas import (
     FIRST_WORD,
     GRID_HEIGHT,
     GRID_WIDTH,
-    LINEAR,
-    QUADRATIC,
     RING,
     ROWS,
     SPACING,
     WALL,
     build_atlas,
-    cell_code,
+    cell_clearance,
     to_grid,
 )
 from outlap.track.track import Track
@@ -27,14 +25,11 @@ from synthetic_tracks import hall, random_map, ring
 
 
 def unpack(atlas, number: int) -> np.ndarray:
-    """The codes of a track's grid, the ring included."""
+    """Clearance or WALL of every cell of a track's grid, the ring included."""
     first, width, height = atlas.index[number, [FIRST_WORD, GRID_WIDTH, GRID_HEIGHT]]
-    return np.array([[cell_code(atlas.words, first, width, col, row) for col in range(width)] for row in range(height)])
-
-
-def decoded(code):
-    """The clearance [cells] that a code stands for."""
-    return code * (LINEAR + QUADRATIC * code)
+    return np.array(
+        [[cell_clearance(atlas.words, first, width, col, row) for col in range(width)] for row in range(height)]
+    )
 
 
 def clearance(occupancy: np.ndarray) -> np.ndarray:
@@ -67,9 +62,8 @@ def test_every_cell_of_every_track_is_a_wall_or_says_how_far_a_ray_can_go(tracks
         inner = cells[RING:-RING, RING:-RING]
         np.testing.assert_array_equal(inner == WALL, track.occupancy)
         exact = clearance(track.occupancy)[~track.occupancy]
-        code = inner[~track.occupancy]
-        assert (decoded(code) <= exact).all()  # more, and a ray would pass through a wall
-        assert ((decoded(code + 1) > exact) | (code == WALL - 1)).all()  # less, and it would only take longer
+        # More, and a ray would pass through a wall; less, and it would only take longer.
+        np.testing.assert_array_equal(inner[~track.occupancy], np.minimum(np.floor(exact), WALL - 1))
 
 
 def test_a_ring_of_wall_surrounds_every_grid(tracks):
@@ -83,7 +77,7 @@ def test_a_ring_of_wall_surrounds_every_grid(tracks):
 def test_clearance_that_four_bits_cannot_hold_is_cut():
     cells = unpack(build_atlas([hall(np.zeros((151, 160), bool))]), 0)
     assert cells[RING + 75, RING + 80] == WALL - 1
-    assert decoded(cells[RING + 75, RING + 20]) <= 20 < decoded(cells[RING + 75, RING + 20] + 1)
+    assert cells[RING + 75, RING + 10] == 10
     assert (cells[RING:-RING, RING:-RING] != WALL).all()
 
 

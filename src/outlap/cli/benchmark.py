@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CASES = ((1, 108), (1, 540), (1, 1080), (2, 540))  # cars, beams
 HOLD = 10  # physics steps that a random command is held
-PLANS = 64  # random commands made beforehand
+PLANS = 64  # random commands and starts made beforehand
 
 
 @dataclass(frozen=True)
@@ -105,37 +105,36 @@ def _measure(settings: BenchmarkSimulator, cars: int, beams: int) -> dict[str, A
     rng = np.random.default_rng(0)
     lengths = np.array([track.centerline.length for track in tracks])
     row, _ = parameter_bounds(VehicleParams())
-    plans = np.stack(
+    commands = np.stack(
         [rng.uniform(-0.2, 0.2, (PLANS, worlds, cars)), rng.uniform(0.0, 8.0, (PLANS, worlds, cars))], axis=-1
     ).astype(np.float32)
+    track = rng.integers(len(tracks), size=(PLANS, worlds)).astype(np.int32)
+    keys = rng.integers(2**63, size=(PLANS, worlds), dtype=np.uint64)
+    starts = np.zeros((PLANS, worlds, cars, 4))
+    starts[..., 0] = (rng.random((PLANS, worlds)) * lengths[track])[..., None] - 2.0 * np.arange(cars)
+    starts[..., 3] = 3.0
+    params = np.broadcast_to(row, (worlds, cars, len(row))).astype(np.float32)
 
-    def reset(which: np.ndarray) -> None:
-        number = rng.integers(len(tracks), size=len(which))
-        starts = np.zeros((len(which), cars, 4))
-        starts[..., 0] = (rng.random(len(which)) * lengths[number])[:, None] - 2.0 * np.arange(cars)
-        starts[..., 3] = 3.0
+    def reset(which: np.ndarray, plan: int) -> None:
         simulator.reset(
-            which,
-            keys=rng.integers(2**63, size=len(which), dtype=np.uint64),
-            tracks=number,
-            params=np.broadcast_to(row, (len(which), cars, len(row))),
-            starts=starts,
-        )
+            which, keys=keys[plan, which], tracks=track[plan, which], params=params[: len(which)],
+            starts=starts[plan, which],
+        )  # fmt: skip
 
-    def drive(steps: int) -> None:
-        for step in range(steps):
-            simulator.step(plans[step // HOLD % PLANS])
+    def drive(first: int, steps: int) -> None:
+        for step in range(first, first + steps):
+            simulator.step(commands[step // HOLD % PLANS])
             crashed = np.flatnonzero(simulator.worlds.contact[:, 0] != FREE)
             if len(crashed):
-                reset(crashed)
+                reset(crashed, step % PLANS)
 
-    reset(np.arange(worlds))
-    drive(2 * HOLD)
+    reset(np.arange(worlds), 0)
+    drive(0, 2 * HOLD)
     rates = []
     for _ in range(settings.repeats):
         steps, begin = 0, time.perf_counter()
         while time.perf_counter() - begin < settings.seconds:
-            drive(HOLD)
+            drive(steps, HOLD)
             steps += HOLD
         rates.append(steps * worlds / (time.perf_counter() - begin))
     return {

@@ -75,7 +75,7 @@ class Worlds(NamedTuple):
     scan: np.ndarray  # float32 (worlds, cars, beams) [m]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _drive(constants, worlds, w, c, steer_command, speed_command):
     """One physics step of one car, walls aside."""
     p = worlds.params[w, c]
@@ -112,7 +112,7 @@ def _drive(constants, worlds, w, c, steer_command, speed_command):
         state[k] = now[k]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _collide(atlas, worlds, w):
     """Find contacts on the way of the last physics step and park the cars that made one."""
     cars = worlds.state.shape[1]
@@ -149,7 +149,7 @@ def _collide(atlas, worlds, w):
                     _park(worlds, w, other, x2, y2, yaw2, HIT_CAR)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _between(worlds, w, c, share):
     """The pose of a car at a share of its last physics step."""
     state = worlds.state[w, c]
@@ -162,7 +162,7 @@ def _between(worlds, w, c, share):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _park(worlds, w, c, x, y, yaw, contact):
     """Stop a car where it made contact; a car that is parked already stays as it is."""
     if worlds.contact[w, c] != FREE:
@@ -177,7 +177,7 @@ def _park(worlds, w, c, x, y, yaw, contact):
     worlds.before[w, c, 0], worlds.before[w, c, 1], worlds.before[w, c, 2] = x, y, state[column.YAW]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _locate(atlas, worlds, w, c):
     """Project a car on the centreline, from where it was; returns the line's length [m]."""
     track = worlds.track[w]
@@ -193,7 +193,7 @@ def _locate(atlas, worlds, w, c):
     return rows * spacing
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _progress(atlas, constants, worlds, w, c):
     """Advance a car's unwrapped distance and its lap clock."""
     s_before = worlds.frenet[w, c, ARC_LENGTH]
@@ -212,7 +212,7 @@ def _progress(atlas, constants, worlds, w, c):
         worlds.next_line[w, c] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _scan(atlas, constants, worlds, w, c):
     """The scan of one car as the world stands."""
     scan = worlds.scan[w, c]
@@ -240,7 +240,7 @@ def _scan(atlas, constants, worlds, w, c):
     spoil(p, key, scan)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _step_world(atlas, constants, worlds, w, commands, repeats):
     cars = worlds.state.shape[1]
     for _ in range(repeats):
@@ -269,7 +269,7 @@ def step_worlds(atlas, constants, worlds, commands, repeats):
         _step_world(atlas, constants, worlds, np.int64(w), commands, repeats)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _place(atlas, constants, worlds, w, c, start):
     """Put a car on the track, at rest but for its speed along its own axis."""
     track = worlds.track[w]
@@ -310,7 +310,7 @@ def _place(atlas, constants, worlds, w, c, start):
 
 
 # Apart from the parallel loop below, in which Numba would lose the assignment of rows.
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _reset_world(atlas, constants, worlds, w, key, track, params, starts):
     worlds.key[w] = key
     worlds.track[w] = track

@@ -139,14 +139,18 @@ class Simulator:
         _check_shape("starts", starts, (n, cars, 4))
         if n == 0:
             return
-        _check(which.min() >= 0 and which.max() < self.num_worlds, "which", which, "no such world")
-        _check(len(np.unique(which)) == n, "which", which, "each world may be named once")
-        _check(tracks.min() >= 0 and tracks.max() < len(self.tracks), "tracks", tracks, "no such track")
+        # Few worlds end at a time: plain Python checks a handful sooner than NumPy.
+        worlds = which.tolist()
+        _check(min(worlds) >= 0 and max(worlds) < self.num_worlds, "which", which, "no such world")
+        _check(len(set(worlds)) == n, "which", which, "each world may be named once")
+        numbers = tracks.tolist()
+        _check(min(numbers) >= 0 and max(numbers) < len(self.tracks), "tracks", tracks, "no such track")
         _check(bool(np.isfinite(params).all()), "params", "NaN or infinity", "it must be finite")
         _check(bool(np.isfinite(starts).all()), "starts", "NaN or infinity", "it must be finite")
         slots = self.worlds.delayed.shape[2]
-        late = params[..., [STEER_DELAY, SPEED_DELAY]].max() / self.config.timestep
-        _check(late < slots - 0.5 + 1e-3, "params", f"a delay of {late:.1f} steps", "raise max_delay")
+        late = max(params[..., STEER_DELAY].max(), params[..., SPEED_DELAY].max()) / self.config.timestep
+        if late >= slots - 0.5 + 1e-3:
+            _check(False, "params", f"a delay of {late:.1f} steps", "raise max_delay")
         self._timed(
             kernels.reset_worlds, self.atlas, self._constants, self.worlds, which,
             keys, tracks, params, starts,
