@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 
 def atomic_write(path: str | os.PathLike[str], content: str | bytes) -> Path:
@@ -23,3 +28,31 @@ def atomic_write(path: str | os.PathLike[str], content: str | bytes) -> Path:
     finally:
         partial.unlink(missing_ok=True)
     return path
+
+
+def to_json(data: Any) -> str:
+    """`data` as indented JSON: NaN and infinity as null, arrays as lists, paths as strings."""
+    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case None | bool() | str():
+            return value
+        case float():  # np.float64 is one too
+            return float(value) if math.isfinite(value) else None
+        case int():
+            return int(value)
+        case os.PathLike():
+            return os.fspath(value)
+        case Mapping():
+            return {str(_plain(key)): _plain(each) for key, each in value.items()}
+        case list() | tuple() | set() | frozenset():
+            return [_plain(each) for each in value]
+    if hasattr(value, "model_dump"):  # a Config
+        return _plain(value.model_dump(mode="json"))
+    if hasattr(value, "tolist"):  # NumPy scalars and arrays, without importing NumPy for those who have none
+        return _plain(value.tolist())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    raise TypeError(f"a {type(value).__name__} has no form in JSON")

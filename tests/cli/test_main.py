@@ -16,9 +16,10 @@ import pytest
 import tyro
 
 from outlap.cli import main as cli
-from outlap.cli.output import CommandResult, to_json
+from outlap.cli.output import CommandResult
 from outlap.config import Config, Number, bounded, load_config
 from outlap.errors import OutlapError
+from outlap.files import to_json
 
 
 class Vehicle(Config):

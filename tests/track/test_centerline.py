@@ -23,7 +23,6 @@ from outlap.track.centerline import (
     Y,
     frenet_point,
     frenet_project,
-    table_value,
 )
 
 CIRCUITS = [
@@ -322,15 +321,3 @@ def test_frenet_project_stays_inside_the_table_whatever_it_is_given() -> None:
             assert not math.isfinite(x) or (math.isfinite(d) and math.isfinite(heading))
     for s in awkward:
         assert np.all(np.isfinite(frenet_point(table, 0, rows, h, s, 0.5)))
-        assert math.isfinite(table_value(table, 0, rows, h, s, CURVATURE))
-
-
-def test_table_value_is_linear_between_rows() -> None:
-    line = wavy()
-    table = np.vstack([np.zeros((4, TABLE_COLUMNS), np.float32), line.table()])
-    rows = len(table) - 4
-    h = line.length / rows
-    s = np.random.default_rng(7).uniform(-1.0, line.length + 1.0, 300)
-    expected = np.interp(s, np.arange(rows) * h, table[4:, CURVATURE], period=line.length)
-    got = [table_value(table, 4, rows, h, value, CURVATURE) for value in s]
-    np.testing.assert_allclose(got, expected, atol=1e-6)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -145,3 +146,12 @@ def test_real_circuits_have_their_walls_and_a_clear_centreline(real_tracks: Path
     col, row = track.world_to_grid(*track.centerline.position(s).T)
     distance = track.distance_field[row.astype(int), col.astype(int)]
     assert np.all((distance > 0.7) & (distance < 1.2))
+
+
+def test_the_fingerprint_tells_two_versions_of_a_map_apart() -> None:
+    track = ring()
+    assert track.fingerprint == ring().fingerprint
+    walls = track.occupancy.copy()
+    walls[20, 5] = True
+    others = [ring(occupancy=walls), ring(yaw=0.1), replace(track, resolution=0.5), track.reversed()]
+    assert len({track.fingerprint, *(other.fingerprint for other in others)}) == 5

@@ -12,6 +12,7 @@ from stable_baselines3 import PPO
 
 from outlap.config import load_config
 from outlap.envs.race_config import RaceConfig
+from outlap.envs.tasks import load_tracks
 from outlap.errors import OutlapError
 from outlap.training.ppo import PPOConfig, Progress, train_ppo
 from outlap.training.run import load_run
@@ -52,6 +53,7 @@ def test_a_run_folder_holds_what_repeats_it() -> None:
     record = json.loads((run.folder / "run.json").read_text())
     assert (record["finished"], record["steps"], record["seed"]) == (True, 512, 0)
     assert record["versions"]["torch"] == torch.__version__
+    assert record["tracks"] == {track.name: track.fingerprint for track in load_tracks(ENV.tracks, ENV.augment_tracks)}
     assert run.policy_path == run.folder / "policy.zip"
     assert list((run.folder / "tensorboard").glob("events.*"))
     assert [report.steps for report in reports] == [128, 256, 384, 512]
@@ -81,9 +83,13 @@ def test_a_stopped_run_goes_on_where_it_was() -> None:
     stopped_after(256, Path("run"))
     run = load_run("run")
     assert run.policy_path.name == "step_000000256.zip"
+    run.write_record(seconds=1000.0)
     reports: list[Progress] = []
     train_ppo(run.config, run.folder, resume=run, on_progress=reports.append)
     assert [report.steps for report in reports] == [384, 512]
+    record = run.record()  # of both sessions together
+    assert record["seconds"] > 1000.0
+    assert record["steps_per_second"] == round(512 / record["seconds"]) == 1
     model = PPO.load(run.folder / "policy.zip", device="cpu")
     assert model.num_timesteps == 512
     # Over which the learning rate falls: the whole training, not what was left of it.

@@ -202,7 +202,7 @@ def evaluate_into(
         "seconds": round(time.monotonic() - begun, 1),
         "driver": driver.name,
         **_policy_record(run),
-        "tracks": names,
+        "tracks": {track.name: track.fingerprint for track in tracks},
         "trained_on": trained_on,
         "episodes_per_track": episodes,
         "seed": seed,

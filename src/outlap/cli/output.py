@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -13,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from outlap.errors import OutlapError
-from outlap.files import atomic_write
+from outlap.files import atomic_write, to_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,11 +66,6 @@ def deliver(result: CommandResult, json_path: str | None) -> None:
     sys.stdout.flush()
 
 
-def to_json(data: Any) -> str:
-    """`data` as indented JSON: NaN and infinity as null, arrays as lists, paths as strings."""
-    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
-
-
 @contextlib.contextmanager
 def standard_output_kept_clean() -> Iterator[None]:
     """Send whatever is printed meanwhile, by libraries and child processes too, to standard error."""
@@ -86,29 +79,6 @@ def standard_output_kept_clean() -> Iterator[None]:
         sys.stderr.flush()
         os.dup2(saved, 1)
         os.close(saved)
-
-
-def _plain(value: Any) -> Any:
-    match value:
-        case None | bool() | str():
-            return value
-        case float():  # np.float64 is one too
-            return float(value) if math.isfinite(value) else None
-        case int():
-            return int(value)
-        case os.PathLike():
-            return os.fspath(value)
-        case Mapping():
-            return {str(_plain(key)): _plain(each) for key, each in value.items()}
-        case list() | tuple() | set() | frozenset():
-            return [_plain(each) for each in value]
-    if hasattr(value, "model_dump"):  # a Config
-        return _plain(value.model_dump(mode="json"))
-    if hasattr(value, "tolist"):  # NumPy scalars and arrays, without importing NumPy for those who have none
-        return _plain(value.tolist())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    raise TypeError(f"a {type(value).__name__} has no form in JSON")
 
 
 def _result_console() -> Console:

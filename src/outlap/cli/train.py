@@ -87,9 +87,7 @@ def train_with_progress(config: PPOConfig, folder: Path, resumed: Run | None, qu
 
 def training_result(run: Run) -> CommandResult:
     """What `outlap train` prints and writes about a finished run."""
-    import json
-
-    record = json.loads((run.folder / "run.json").read_text())
+    record = run.record()
     data = {
         "run": run.folder,
         "policy": run.policy_path,

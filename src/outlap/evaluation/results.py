@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from outlap.errors import OutlapError
-from outlap.files import atomic_write
+from outlap.files import atomic_write, to_json
 
 ROWS, SUMMARY, RECORD = "episodes.parquet", "summary.json", "evaluation.json"
 
@@ -45,4 +44,4 @@ def save_results(folder: Path, rows: pd.DataFrame, summary: Mapping[str, Any], r
     rows.to_parquet(buffer, index=False)
     atomic_write(folder / ROWS, buffer.getvalue())
     for name, content in ((SUMMARY, summary), (RECORD, record)):
-        atomic_write(folder / name, json.dumps(content, indent=2, default=str) + "\n")
+        atomic_write(folder / name, to_json(content) + "\n")

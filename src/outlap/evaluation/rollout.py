@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 from gymnasium.vector import AutoresetMode
 
-from outlap.config import Config, bounds
 from outlap.drivers.driver import Driver
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race import EGO
@@ -25,6 +24,7 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.tasks import load_tracks
 from outlap.envs.terminations import CRASH, TerminationConfig
 from outlap.errors import OutlapError
+from outlap.simulator.vehicle import parameter_bounds, parameter_names
 from outlap.track.track import Track
 
 DEFAULT_WORLDS = 128
@@ -246,14 +246,5 @@ def _underway(config: RaceConfig, length: float, start: np.ndarray, info: dict[s
 
 def drawn_parameters(config: RaceConfig) -> dict[str, int]:
     """Those of a car's parameters that are ranges: the name of each in a row, and its `vehicle` column."""
-    vehicle, names, ranges = config.vehicle, [], []
-    parts = (
-        ("vehicle", vehicle), ("vehicle_tyre", vehicle.tyre), ("actuators", config.actuators), ("lidar", config.lidar),
-    )  # fmt: skip
-    for prefix, part in parts:  # in the order of `vehicle.parameter_bounds`
-        for name in type(part).model_fields:
-            value = getattr(part, name)
-            if not isinstance(value, Config):
-                names.append(f"{prefix}_{name}")
-                ranges.append(bounds(value))
-    return {names[i]: i for i, (low, high) in enumerate(ranges) if low < high}
+    low, high = parameter_bounds(config.vehicle, config.actuators, config.lidar)
+    return {name: column for column, name in enumerate(parameter_names()) if low[column] < high[column]}

@@ -7,7 +7,7 @@ and the largest row of a configuration.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -193,16 +193,24 @@ def parameter_bounds(
         low, high: float32 (N_PARAMS,) each, equal where a value is fixed. Draw uniformly between them.
         KINEMATIC_SPEED is 0 in both: fill it with `dynamics.kinematic_speed` of each row drawn.
     """
-    ends = [bounds(value) for value in _numbers(vehicle)]
-    ends += [bounds(value) for value in _numbers(vehicle.tyre)]
-    ends += [bounds(value) for value in _numbers(actuators or ActuatorParams())]
-    ends += [bounds(value) for value in _numbers(lidar or LidarParams())]
+    parts = _parts(vehicle, actuators or ActuatorParams(), lidar or LidarParams())
+    ends = [bounds(getattr(part, name)) for _, part in parts for name in _numbers(part)]
     ends.append((0.0, 0.0))  # KINEMATIC_SPEED
     table = np.array(ends, dtype=np.float32)
     return table[:, 0].copy(), table[:, 1].copy()
 
 
-def _numbers(config: Config) -> list[Any]:
-    """The values of the numeric fields, in order; nested configurations left out."""
-    values = [getattr(config, name) for name in type(config).model_fields]
-    return [value for value in values if not isinstance(value, Config)]
+def parameter_names() -> list[str]:
+    """What each column of a parameter row is called in results: `vehicle_mu`, `lidar_noise_std`."""
+    parts = _parts(VehicleParams(), ActuatorParams(), LidarParams())
+    return [f"{prefix}_{name}" for prefix, part in parts for name in _numbers(part)] + ["kinematic_speed"]
+
+
+def _parts(vehicle: VehicleParams, actuators: ActuatorParams, lidar: LidarParams) -> list[tuple[str, Config]]:
+    """What a parameter row is made of, in the order of its columns."""
+    return [("vehicle", vehicle), ("vehicle_tyre", vehicle.tyre), ("actuators", actuators), ("lidar", lidar)]
+
+
+def _numbers(config: Config) -> list[str]:
+    """The names of the numeric fields, in order; nested configurations left out."""
+    return [name for name in type(config).model_fields if not isinstance(getattr(config, name), Config)]

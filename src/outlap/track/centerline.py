@@ -379,14 +379,3 @@ def frenet_point(table, row0, rows, h, s, d):
     x = table[a, X] + t * (ax + t * (c2x + t * c3x)) - norm * velocity_y
     y = table[a, Y] + t * (ay + t * (c2y + t * c3y)) + norm * velocity_x
     return x, y, math.atan2(velocity_y, velocity_x)
-
-
-@njit(cache=True, error_model="numpy")
-def table_value(table, row0, rows, h, s, column):
-    """A column of the table at `s` [m], linear between rows."""
-    s = _wrap(float(s), rows * h)
-    scaled = s / h
-    i = min(int(scaled), rows - 1)
-    t = scaled - i
-    a = table[row0 + i, column]
-    return a + t * (table[row0 + (i + 1 if i + 1 < rows else 0), column] - a)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 from dataclasses import dataclass, replace
@@ -110,6 +111,14 @@ class Track:
         field = wall_distance(self.occupancy, self.resolution)
         field.setflags(write=False)
         return field
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of walls, their place and the centreline: what tells two versions of a map apart."""
+        digest = hashlib.sha256(np.packbits(self.occupancy).tobytes())
+        digest.update(np.array([*self.occupancy.shape, self.resolution, *self.origin], np.float64).tobytes())
+        digest.update(self.centerline.table().tobytes())
+        return digest.hexdigest()
 
     def world_to_grid(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Map frame [m] → (column, row) as floats; the floor of each is the pixel's index."""

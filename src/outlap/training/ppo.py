@@ -72,6 +72,17 @@ class Progress:
     progress_m: float | None
 
 
+class Stopwatch:
+    """Seconds of a training, those of earlier sessions included."""
+
+    def __init__(self, before: float) -> None:
+        self._start = time.monotonic() - before
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._start
+
+
 def train_ppo(
     config: PPOConfig,
     folder: Path,
@@ -107,6 +118,7 @@ def train_ppo(
     run = resume or create_run(folder, config)
     if resume:
         run.begin_session()
+    run.write_record(tracks={track.name: track.fingerprint for track in environment.env.tasks.tracks})
     model = _newest_model(run, environment, config) if resume else None
     if model is None:
         model = PPO(
@@ -135,24 +147,23 @@ def train_ppo(
     # A resumed run must not race the episodes again that it has raced before.
     environment.seed(int(np.random.SeedSequence([config.seed, begun_at]).generate_state(1)[0]))
     model.set_logger(configure(str(run.folder / "tensorboard"), ["tensorboard"]))
-    started = time.monotonic()
+    clock = Stopwatch(float(run.record().get("seconds", 0.0)) if begun_at else 0.0)
     try:
         if begun_at < config.total_steps:
             model.learn(
                 config.total_steps - begun_at,
-                callback=_watcher(run, config, on_progress),
+                callback=_watcher(run, config, clock, on_progress),
                 reset_num_timesteps=begun_at == 0,
             )
     except KeyboardInterrupt:
         save_checkpoint(run, model, _checkpoint_name(model))
+        run.note_pace(model.num_timesteps, clock.seconds)
         raise
     save_checkpoint(run, model, "policy.zip")
-    seconds = time.monotonic() - started
-    run.write_record(
+    run.note_pace(
+        model.num_timesteps,
+        clock.seconds,
         finished=True,
-        steps=model.num_timesteps,
-        seconds=round(seconds, 1),
-        steps_per_second=round((model.num_timesteps - begun_at) / max(seconds, 1e-9)),
         compile_seconds=environment.env.race.simulator.compile_seconds,
     )
     return run
@@ -181,7 +192,7 @@ def _newest_model(run: Run, environment, config: PPOConfig):
     return None
 
 
-def _watcher(run: Run, config: PPOConfig, on_progress: Callable[[Progress], None] | None):
+def _watcher(run: Run, config: PPOConfig, clock: Stopwatch, on_progress: Callable[[Progress], None] | None):
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Watcher(BaseCallback):
@@ -190,8 +201,6 @@ def _watcher(run: Run, config: PPOConfig, on_progress: Callable[[Progress], None
         def _on_training_start(self) -> None:
             self.episodes: deque[dict] = deque(maxlen=RECENT_EPISODES)
             self.saved_at = self.model.num_timesteps
-            self.begun_at = self.model.num_timesteps
-            self.clock = time.monotonic()
 
         def _on_step(self) -> bool:
             self.episodes.extend(info for info in self.locals["infos"] if "episode" in info)
@@ -201,6 +210,7 @@ def _watcher(run: Run, config: PPOConfig, on_progress: Callable[[Progress], None
             # Here, and not where a rollout ends: by now the policy has learnt from all that it has seen.
             if self.model.num_timesteps - self.saved_at >= config.checkpoint_every:
                 save_checkpoint(run, self.model, _checkpoint_name(self.model))
+                run.note_pace(self.model.num_timesteps, clock.seconds)
                 self.saved_at = self.model.num_timesteps
 
         def _on_rollout_end(self) -> None:
@@ -227,7 +237,7 @@ def _watcher(run: Run, config: PPOConfig, on_progress: Callable[[Progress], None
                     Progress(
                         steps=steps,
                         total_steps=config.total_steps,
-                        steps_per_second=(steps - self.begun_at) / (time.monotonic() - self.clock),
+                        steps_per_second=steps / clock.seconds,
                         crash_rate=crash_rate,
                         mean_speed_mps=numbers.get("mean_speed_mps"),
                         progress_m=numbers.get("progress_m"),

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from outlap.config import load_config, save_config
 from outlap.errors import OutlapError
-from outlap.files import atomic_write
+from outlap.files import atomic_write, to_json
 
 if TYPE_CHECKING:
     from outlap.training.ppo import PPOConfig
@@ -56,20 +56,26 @@ class Run:
     @property
     def finished(self) -> bool:
         """Whether the training came to its end."""
-        return bool(self._record().get("finished"))
+        return bool(self.record().get("finished"))
+
+    def note_pace(self, steps: int, seconds: float, **facts: Any) -> None:
+        """Note in run.json how far the training is, and how long all its sessions together took so far."""
+        self.write_record(
+            steps=steps, seconds=round(seconds, 1), steps_per_second=round(steps / max(seconds, 1e-9)), **facts
+        )
 
     def begin_session(self) -> None:
         """Note in run.json that the training goes on, by which command and where."""
-        self.write_record(resumed=[*self._record().get("resumed", []), provenance()])
+        self.write_record(resumed=[*self.record().get("resumed", []), provenance()])
 
-    def _record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
+        """What run.json says."""
         path = self.folder / "run.json"
         return json.loads(path.read_text()) if path.exists() else {}
 
     def write_record(self, **facts: Any) -> None:
         """Add facts to run.json."""
-        text = json.dumps({**self._record(), **facts}, indent=2, default=str) + "\n"
-        atomic_write(self.folder / "run.json", text)
+        atomic_write(self.folder / "run.json", to_json({**self.record(), **facts}) + "\n")
 
 
 def create_run(folder: Path, config: PPOConfig) -> Run:
