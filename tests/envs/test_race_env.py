@@ -21,7 +21,7 @@ from outlap.errors import OutlapError
 from outlap.simulator.atlas import FIRST_ROW, ROWS
 
 NAME = "outlap/Race-v0"
-EVERYTHING = ("scan", "pose", "vel", "heading", "previous_action", "frenet", "curvature_ahead")
+EVERYTHING = ("scan", "pose", "vel", "heading", "previous_action", "previous_reward", "frenet", "curvature_ahead")
 
 
 def test_importing_outlap_registers_the_environment():

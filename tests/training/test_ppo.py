@@ -14,8 +14,9 @@ from outlap.config import load_config
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.tasks import load_tracks
 from outlap.errors import OutlapError
-from outlap.training.ppo import PPOConfig, Progress, train_ppo
+from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
+from outlap.training.session import Progress, train
 from synthetic_tracks import ring
 
 ENV = RaceConfig(
@@ -48,7 +49,7 @@ def weights(path: Path) -> np.ndarray:
 
 def test_a_run_folder_holds_what_repeats_it() -> None:
     reports: list[Progress] = []
-    run = train_ppo(SMALL, Path("run"), on_progress=reports.append)
+    run = train(SMALL, Path("run"), on_progress=reports.append)
     assert load_config(PPOConfig, run.folder / "config.yaml") == SMALL
     record = json.loads((run.folder / "run.json").read_text())
     assert (record["finished"], record["steps"], record["seed"]) == (True, 512, 0)
@@ -62,9 +63,9 @@ def test_a_run_folder_holds_what_repeats_it() -> None:
 
 
 def test_the_same_seed_gives_the_same_policy_and_another_one_does_not() -> None:
-    first, second = (train_ppo(SMALL, Path(name)) for name in ("a", "b"))
+    first, second = (train(SMALL, Path(name)) for name in ("a", "b"))
     np.testing.assert_array_equal(weights(first.policy_path), weights(second.policy_path))
-    third = train_ppo(SMALL.model_copy(update={"seed": 1}), Path("c"))
+    third = train(SMALL.model_copy(update={"seed": 1}), Path("c"))
     assert not np.array_equal(weights(first.policy_path), weights(third.policy_path))
 
 
@@ -76,7 +77,7 @@ def stopped_after(steps: int, folder: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_ppo(SMALL, folder, on_progress=stop)
+        train(SMALL, folder, on_progress=stop)
 
 
 def test_a_stopped_run_goes_on_where_it_was() -> None:
@@ -85,7 +86,7 @@ def test_a_stopped_run_goes_on_where_it_was() -> None:
     assert run.policy_path.name == "step_000000256.zip"
     run.write_record(seconds=1000.0)
     reports: list[Progress] = []
-    train_ppo(run.config, run.folder, resume=run, on_progress=reports.append)
+    train(run.config, run.folder, resume=run, on_progress=reports.append)
     assert [report.steps for report in reports] == [384, 512]
     record = run.record()  # of both sessions together
     assert record["seconds"] > 1000.0
@@ -102,15 +103,15 @@ def test_a_broken_checkpoint_gives_way_to_the_one_before() -> None:
     newest = run.checkpoints()[0]
     newest.write_bytes(newest.read_bytes()[:1000])
     reports: list[Progress] = []
-    train_ppo(run.config, run.folder, resume=run, on_progress=reports.append)
+    train(run.config, run.folder, resume=run, on_progress=reports.append)
     assert reports[0].steps == 384
     assert newest.name in json.dumps(json.loads((run.folder / "run.json").read_text()))
 
 
 def test_a_finished_run_is_not_trained_further() -> None:
-    run = train_ppo(SMALL, Path("run"))
+    run = train(SMALL, Path("run"))
     before = weights(run.policy_path)
-    train_ppo(run.config, run.folder, resume=load_run("run"))
+    train(run.config, run.folder, resume=load_run("run"))
     np.testing.assert_array_equal(weights(run.policy_path), before)
 
 
@@ -123,16 +124,16 @@ def test_curricula_go_on_from_where_the_run_was(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(
         RaceVectorEnv, "training_steps", property(lambda env: 0, lambda env, steps: seen.append(int(steps)))
     )
-    train_ppo(run.config, run.folder, resume=run)
+    train(run.config, run.folder, resume=run)
     assert seen == [256]
 
 
 def test_nothing_is_overwritten_and_mistakes_leave_no_folder() -> None:
-    train_ppo(SMALL, Path("run"))
+    train(SMALL, Path("run"))
     with pytest.raises(OutlapError, match="holds a run already"):
-        train_ppo(SMALL, Path("run"))
+        train(SMALL, Path("run"))
     with pytest.raises(OutlapError, match="no track is called 'nowhere'"):
-        train_ppo(SMALL.model_copy(update={"env": ENV.model_copy(update={"tracks": ("nowhere",)})}), Path("other"))
+        train(SMALL.model_copy(update={"env": ENV.model_copy(update={"tracks": ("nowhere",)})}), Path("other"))
     assert not Path("other").exists()
     with pytest.raises(OutlapError, match="is not a run folder"):
         load_run("other")
@@ -144,7 +145,7 @@ def test_it_learns_to_drive_round_a_ring() -> None:
                 "learning_rate": 1e-3, "checkpoint_every": 10**9}
     )  # fmt: skip
     reports: list[Progress] = []
-    train_ppo(config, Path("run"), on_progress=reports.append)
+    train(config, Path("run"), on_progress=reports.append)
     begin, end = reports[2].progress_m, reports[-1].progress_m
     assert begin is not None
     assert end is not None

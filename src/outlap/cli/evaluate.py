@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -76,8 +75,6 @@ class Evaluate:
 
     def run(self) -> CommandResult:
         self._check_flags()
-        # Numba's threads and torch's take turns: those that wait must not keep a core busy.
-        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         from outlap.envs.tasks import load_tracks
         from outlap.evaluation.rollout import standing_starts
 
@@ -139,6 +136,7 @@ class Evaluate:
 
         return PolicyDriver.load(
             run.policy_path,
+            algorithm=run.config.model_class(),
             scale_observations=run.config.env.scale_observations,
             deterministic=not self.stochastic,
             seed=self.seed,

@@ -50,6 +50,7 @@ COMMANDS = (
     Entry("tracks import", "outlap.cli.tracks:ImportTrack", "make an F1TENTH map folder of a centreline csv"),
     Entry("tracks download", "outlap.cli.tracks:DownloadTracks", "get circuits from the official archive"),
     Entry("train ppo", "outlap.cli.train:TrainPPO", "train a policy with PPO and domain randomization"),
+    Entry("train mql", "outlap.cli.train:TrainMQL", "meta-train a policy with Meta-Q-Learning"),
     Entry("evaluate", "outlap.cli.evaluate:Evaluate", "race a trained policy on tracks and measure it"),
     Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),
     Entry("demo", "outlap.cli.demo:Demo", "train and evaluate on built-in circuits in a few minutes"),

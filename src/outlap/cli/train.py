@@ -1,8 +1,7 @@
-"""`outlap train ppo`."""
+"""`outlap train ppo` and `outlap train mql`."""
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from dataclasses import dataclass, field
@@ -13,23 +12,20 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
+from outlap.config import load_config
 from outlap.errors import OutlapError
-from outlap.training.ppo import PPOConfig, Progress, train_ppo
+from outlap.training.mql import MQLConfig
+from outlap.training.ppo import PPOConfig
 from outlap.training.run import Run, load_run
+from outlap.training.session import Progress, TrainingConfig, train
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
 @dataclass(frozen=True)
-class TrainPPO:
-    """Train a policy with PPO and domain randomization (the paper's Vanilla DR).
-
-    Any vehicle, sensor or actuator parameter given as two numbers is drawn anew at each reset:
-    --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
-    """
-
-    settings: Annotated[PPOConfig, arg(name="")] = field(default_factory=PPOConfig)
+class _Train:
+    """What the trainings of all algorithms have in common; each adds its `settings`."""
 
     config: Path | None = None
     """YAML file with values in place of the defaults; flags override it."""
@@ -46,27 +42,60 @@ class TrainPPO:
     json: str | None = None
     """Write the result as JSON to this file; - for standard output."""
 
-    @classmethod
-    def from_config(cls, path: Path) -> TrainPPO:
-        """The defaults of `--config`."""
-        from outlap.config import load_config
-
-        return cls(settings=load_config(PPOConfig, path))
-
-    def run(self) -> CommandResult:
-        if self.resume and (self.out or self.config or self.settings != PPOConfig()):
+    def train(self, settings: TrainingConfig) -> CommandResult:
+        """Train as `settings` say, or go on with what is to be resumed."""
+        name = settings.algorithm
+        if self.resume and (self.out or self.config or settings != type(settings).model_validate({})):
             raise OutlapError("--resume goes on with the run's own configuration and folder; leave the other flags out")
         resumed = load_run(self.resume) if self.resume else None
-        config = resumed.config if resumed else self.settings
-        folder = resumed.folder if resumed else self.out or Path("runs") / time.strftime("ppo-%Y%m%d-%H%M%S")
+        if resumed and resumed.config.algorithm != name:
+            raise OutlapError(f"--resume {self.resume}: was trained with {resumed.config.algorithm}, not {name}")
+        config = resumed.config if resumed else settings
+        folder = resumed.folder if resumed else self.out or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
         run = train_with_progress(config, folder, resumed, self.quiet)
         return training_result(run)
 
 
-def train_with_progress(config: PPOConfig, folder: Path, resumed: Run | None, quiet: bool) -> Run:
+@dataclass(frozen=True)
+class TrainPPO(_Train):
+    """Train a policy with PPO and domain randomization (the paper's Vanilla DR).
+
+    Any vehicle, sensor or actuator parameter given as two numbers is drawn anew at each reset:
+    --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
+    """
+
+    settings: Annotated[PPOConfig, arg(name="")] = field(default_factory=PPOConfig)
+
+    @classmethod
+    def from_config(cls, path: Path) -> TrainPPO:
+        """The defaults of `--config`."""
+        return cls(settings=load_config(PPOConfig, path))
+
+    def run(self) -> CommandResult:
+        return self.train(self.settings)
+
+
+@dataclass(frozen=True)
+class TrainMQL(_Train):
+    """Meta-train a policy with Meta-Q-Learning: TD3 with a context of the last steps.
+
+    Any vehicle, sensor or actuator parameter given as two numbers is drawn anew at each reset:
+    --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
+    """
+
+    settings: Annotated[MQLConfig, arg(name="")] = field(default_factory=MQLConfig)
+
+    @classmethod
+    def from_config(cls, path: Path) -> TrainMQL:
+        """The defaults of `--config`."""
+        return cls(settings=load_config(MQLConfig, path))
+
+    def run(self) -> CommandResult:
+        return self.train(self.settings)
+
+
+def train_with_progress(config: TrainingConfig, folder: Path, resumed: Run | None, quiet: bool) -> Run:
     """Train with a progress bar; after Ctrl-C say how to go on."""
-    # Numba's threads and torch's take turns: those that wait must not keep a core busy.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with progress_bar("training", config.total_steps, "steps", quiet) as update:
 
         def on_progress(progress: Progress) -> None:
@@ -79,9 +108,9 @@ def train_with_progress(config: PPOConfig, folder: Path, resumed: Run | None, qu
             update(progress.steps, note)
 
         try:
-            return train_ppo(config, folder, resume=resumed, on_progress=on_progress)
+            return train(config, folder, resume=resumed, on_progress=on_progress)
         except KeyboardInterrupt:
-            print(f"\nsaved; go on with: outlap train ppo --resume {folder}", file=sys.stderr)
+            print(f"\nsaved; go on with: outlap train {config.algorithm} --resume {folder}", file=sys.stderr)
             raise
 
 

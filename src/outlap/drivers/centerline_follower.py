@@ -25,6 +25,9 @@ class CenterlineFollower:
     observation_terms: tuple[str, ...] = ("frenet", "curvature_ahead")
     scale_observations: bool = False
 
+    def begin(self, cars: np.ndarray) -> None:
+        """See `Driver.begin`; it remembers nothing."""
+
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See `Driver.act`."""
         offset, heading_error = observation["frenet"].T

@@ -23,6 +23,10 @@ class Driver(Protocol):
         """Whether terms are to be divided by their scale."""
         ...
 
+    def begin(self, cars: np.ndarray) -> None:
+        """Hear which cars begin an episode with the next observation: bool (n,). Forget what was before."""
+        ...
+
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """Actions in [-1, 1]: (n, 2) steer, speed, from observations (n, size) of n cars."""
         ...

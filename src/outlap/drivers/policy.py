@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -58,6 +58,8 @@ class PolicyDriver:
         self._policy.set_training_mode(False)
         self._deterministic = deterministic
         self._random = None if deterministic else _random_state(seed)
+        self._begins = np.zeros(0, bool)
+        self._memories: list[Any] = []  # of each block of cars; None for a policy without a memory
         self._padded = {
             term: np.zeros((BATCH, *box.shape), np.float32)  # type: ignore[misc]
             for term, box in space.spaces.items()
@@ -68,26 +70,27 @@ class PolicyDriver:
         cls,
         path: str | os.PathLike[str],
         *,
+        algorithm: type[BaseAlgorithm] | None = None,
         scale_observations: bool,
         deterministic: bool = True,
         seed: int = 0,
         name: str = "policy",
     ) -> PolicyDriver:
-        """A PPO model from the file that Stable-Baselines3 wrote, on the CPU.
+        """A model of an algorithm, PPO's by default, from the file that Stable-Baselines3 wrote, on the CPU.
 
         Such a file can run code when it is loaded: load those of people you trust.
 
         Raises OutlapError for a file that is missing, broken or of another algorithm.
         """
-        from stable_baselines3 import PPO
-
+        if algorithm is None:
+            from stable_baselines3 import PPO as algorithm
         if not Path(path).is_file():
             raise OutlapError(f"{path}: no such file; must be a policy that outlap train wrote")
         try:
-            model = PPO.load(Path(path), device="cpu")
+            model = algorithm.load(Path(path), device="cpu")
         except Exception as error:  # whatever a broken archive or pickle raises
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise OutlapError(f"{path}: cannot be loaded as a PPO model: {reason}") from error
+            raise OutlapError(f"{path}: cannot be loaded as a {algorithm.__name__} model: {reason}") from error
         return cls(
             model,
             scale_observations=scale_observations,
@@ -122,6 +125,10 @@ class PolicyDriver:
                         f"{now[at]:g}; evaluate it with the same scaling and range"
                     )
 
+    def begin(self, cars: np.ndarray) -> None:
+        """See `Driver.begin`; a policy with a memory forgets what it remembers of these cars."""
+        self._begins = np.array(cars, bool)
+
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See `Driver.act`; raises OutlapError for an observation that the policy was not trained on."""
         count = len(observation[next(iter(observation))]) if observation else 0
@@ -142,13 +149,26 @@ class PolicyDriver:
         return actions
 
     def _act(self, observation: dict[str, np.ndarray], count: int) -> np.ndarray:
+        if len(self._begins) != count:  # other cars than before
+            self.begin(np.ones(count, bool))
+            self._memories = []
         actions = np.empty((count, 2), np.float32)
-        for first in range(0, count, BATCH):
+        for block, first in enumerate(range(0, count, BATCH)):
             rows = min(BATCH, count - first)
             for term, padded in self._padded.items():
                 padded[:rows] = observation[term][first : first + rows]
-            chosen, _ = self._policy.predict(self._padded, deterministic=self._deterministic)  # type: ignore[arg-type]
+            begins = np.zeros(BATCH, bool)
+            begins[:rows] = self._begins[first : first + rows]
+            if block == len(self._memories):
+                self._memories.append(None)
+            chosen, self._memories[block] = self._policy.predict(
+                self._padded,
+                self._memories[block],
+                begins,
+                self._deterministic,  # type: ignore[arg-type]
+            )
             actions[first : first + rows] = chosen[:rows]
+        self._begins[:] = False
         return actions
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import gymnasium as gym
 import numpy as np
 
-from outlap.envs.race import Race
+from outlap.envs.race import EGO, Race
 from outlap.simulator import state as column
 from outlap.simulator.kernels import HEADING_ERROR, OFFSET
 from outlap.track.centerline import CURVATURE
@@ -60,6 +60,11 @@ def previous_action(race: Race, car: int) -> np.ndarray:
     return race.actions[:, car]
 
 
+def previous_reward(race: Race, car: int) -> np.ndarray:
+    """The ego's reward of the step before; 0 after a reset. No reward is counted for other cars: 0."""
+    return race.rewards[:, None] if car == EGO else np.zeros_like(race.rewards)[:, None]
+
+
 def frenet(race: Race, car: int) -> np.ndarray:
     """Offset to the left of the centreline [m] and heading relative to it [rad]. Needs the map."""
     return race.worlds.frenet[:, car, [OFFSET, HEADING_ERROR]]
@@ -78,6 +83,7 @@ OBSERVATION_TERMS: dict[str, ObservationTerm] = {
     "vel": ObservationTerm(vel, low=(-INF,), high=(INF,), scale=(10.0, 2.0, 5.0), size=3),
     "heading": ObservationTerm(heading, low=(-math.pi,), high=(math.pi,), scale=(0.4, 0.4), size=2),
     "previous_action": ObservationTerm(previous_action, low=(-1.0,), high=(1.0,), scale=(1.0,), size=2),
+    "previous_reward": ObservationTerm(previous_reward, low=(-INF,), high=(INF,), scale=(0.1,), size=1),
     "frenet": ObservationTerm(frenet, low=(-INF, -math.pi), high=(INF, math.pi), scale=(1.0, 1.0), size=2),
     "curvature_ahead": ObservationTerm(
         curvature_ahead, low=(-INF,), high=(INF,), scale=(0.5,), size=len(CURVATURE_AHEAD)

@@ -38,6 +38,7 @@ class Race:
     ahead: np.ndarray = field(init=False)  # (worlds, cars) whether the ego is ahead of each car
     places_gained: np.ndarray = field(init=False)  # (worlds,) in this step
     places_lost: np.ndarray = field(init=False)
+    rewards: np.ndarray = field(init=False)  # (worlds,) of this step, 0 after a reset
 
     def __post_init__(self) -> None:
         simulator = self.simulator
@@ -57,6 +58,7 @@ class Race:
         self.ahead = np.zeros((worlds, cars), bool)
         self.places_gained = np.zeros(worlds, np.int64)
         self.places_lost = np.zeros(worlds, np.int64)
+        self.rewards = np.zeros(worlds)
 
     @property
     def worlds(self):
@@ -108,6 +110,7 @@ class Race:
         self.ahead[which] = distance[:, None] > worlds.distance[which]
         self.places_gained[which] = 0
         self.places_lost[which] = 0
+        self.rewards[which] = 0.0
 
     def act(self, actions: np.ndarray) -> None:
         """Take note of the actions (worlds, cars, 2) that the next step will carry out."""

@@ -298,6 +298,7 @@ class RaceVectorEnv(VectorEnv):
             value = weight * REWARD_TERMS[name](self.race, self.config.reward)
             self._totals[name] += value
             total += value
+        self.race.rewards[:] = total
         return total
 
     def _count(self, rewards: np.ndarray) -> None:

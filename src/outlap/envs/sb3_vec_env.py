@@ -49,6 +49,7 @@ class SB3VecEnv(VecEnv):
         done = terminated | truncated
         infos = [self._world_info(info, world) for world in range(self.num_envs)]
         for world in np.flatnonzero(done):
+            self.reset_infos[world] = infos[world]  # of the episode that begins
             final = {name: info["final_info"][name][world] for name in info["final_info"] if name[0] != "_"}
             infos[world] = {
                 **final,

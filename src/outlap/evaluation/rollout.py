@@ -167,6 +167,7 @@ def _race(
     racing = np.arange(worlds)  # the episode of each world
     upcoming = worlds
     observation, _ = env.reset(seed=seeds[:worlds].tolist())
+    driver.begin(np.ones(worlds, bool))
     start = env.race.start.copy()
     steps = 0
     while len(rows) < len(seeds):
@@ -197,6 +198,7 @@ def _race(
                     again[world] = int(seeds[upcoming])
                     upcoming += 1
             observation, info = env.reset(seed=again, options={"reset_mask": over})
+            driver.begin(over)
             start[over] = env.race.start[over]
         watch(len(rows), len(rows) + _underway(config, length, start, info, racing != IDLE), steps)
     return [rows[episode] for episode in range(len(seeds))], steps

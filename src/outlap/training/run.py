@@ -4,6 +4,7 @@ config.yaml      the configuration
 run.json         command, seed, versions, machine, how far it came
 checkpoints/     step_N.zip, the newest few
 policy.zip       the finished policy
+replay.npz       what an off-policy learner has seen
 tensorboard/
 """
 
@@ -22,12 +23,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from outlap.config import load_config, save_config
 from outlap.errors import OutlapError
 from outlap.files import atomic_write, to_json
 
 if TYPE_CHECKING:
-    from outlap.training.ppo import PPOConfig
+    from outlap.training.session import TrainingConfig
 
 CHECKPOINTS_KEPT = 3
 PACKAGES = ("outlap", "numpy", "numba", "torch", "stable-baselines3", "gymnasium")
@@ -38,7 +41,7 @@ class Run:
     """A run folder that exists."""
 
     folder: Path
-    config: PPOConfig
+    config: TrainingConfig
 
     @property
     def policy_path(self) -> Path:
@@ -46,7 +49,13 @@ class Run:
         for path in (self.folder / "policy.zip", *self.checkpoints()):
             if zipfile.is_zipfile(path):
                 return path
-        raise OutlapError(f"{self.folder}: holds no policy yet; train it with: outlap train ppo --resume {self.folder}")
+        command = f"outlap train {self.config.algorithm} --resume {self.folder}"
+        raise OutlapError(f"{self.folder}: holds no policy yet; train it with: {command}")
+
+    @property
+    def replay_path(self) -> Path:
+        """The replay of a learner that has one."""
+        return self.folder / "replay.npz"
 
     def checkpoints(self) -> list[Path]:
         """Checkpoints, newest first."""
@@ -78,7 +87,7 @@ class Run:
         atomic_write(self.folder / "run.json", to_json({**self.record(), **facts}) + "\n")
 
 
-def create_run(folder: Path, config: PPOConfig) -> Run:
+def create_run(folder: Path, config: TrainingConfig) -> Run:
     """Make a run folder. Raises OutlapError if there is one already, or it cannot be written."""
     if (folder / "config.yaml").exists():
         raise OutlapError(f"{folder}: holds a run already; resume it with --resume {folder}, or give another --out")
@@ -94,12 +103,26 @@ def create_run(folder: Path, config: PPOConfig) -> Run:
 
 def load_run(folder: str | os.PathLike[str]) -> Run:
     """A run folder made by `outlap train`. Raises OutlapError where it is missing or broken."""
-    from outlap.training.ppo import PPOConfig
-
     folder = Path(folder)
     if not (folder / "config.yaml").is_file():
-        raise OutlapError(f"{folder}: is not a run folder, it has no config.yaml; make one with outlap train ppo")
-    return Run(folder, load_config(PPOConfig, folder / "config.yaml"))
+        raise OutlapError(f"{folder}: is not a run folder, it has no config.yaml; make one with outlap train")
+    return Run(folder, load_config(_config_class(folder / "config.yaml"), folder / "config.yaml"))
+
+
+def _config_class(path: Path) -> type[TrainingConfig]:
+    """The configuration of the algorithm that a file names; PPO's where it names none."""
+    from outlap.training.mql import MQLConfig
+    from outlap.training.ppo import PPOConfig
+
+    classes: dict[str, type[TrainingConfig]] = {"ppo": PPOConfig, "mql": MQLConfig}
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError, yaml.YAMLError):
+        return PPOConfig  # to load it will say what is wrong
+    name = content.get("algorithm", "ppo") if isinstance(content, dict) else "ppo"
+    if name not in classes:
+        raise OutlapError(f"{path}: algorithm is {name!r:.60}; must be one of {', '.join(classes)}")
+    return classes[name]
 
 
 def save_checkpoint(run: Run, model: Any, name: str) -> Path:

@@ -1,0 +1,1 @@
+"""Meta-Q-Learning with adaptive β clipping, on Stable-Baselines3."""

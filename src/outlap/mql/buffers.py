@@ -1,0 +1,433 @@
+"""Replay for a learner with a memory: every step is stored once, windows are gathered by index.
+
+A row is what a learner knows at one moment: the observation, and the action and the reward that led to it. Rows
+have serial numbers in the order in which they were added; a ring of `capacity` rows keeps the newest. Each row
+names the row before it and the one after it in its episode, so that episodes of many worlds may lie mixed, and a
+window stops where its episode began or where older rows are gone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from outlap.errors import OutlapError
+
+NONE = -1  # serial of no row
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Sequences of rows, oldest first; (n, length, ...)."""
+
+    observation: dict[str, np.ndarray]  # (n, length, size) of each term asked for, as stored
+    action: np.ndarray  # float32 (n, length, actions) that led to each row; 0 at an episode's start
+    reward: np.ndarray  # float32 (n, length) that came with it
+    valid: np.ndarray  # bool (n, length): False before an episode's start, where all else is 0
+
+    def first(self, rows: int) -> Windows:
+        """The first `rows` rows of each."""
+        observation = {name: values[:, :rows] for name, values in self.observation.items()}
+        return Windows(observation, self.action[:, :rows], self.reward[:, :rows], self.valid[:, :rows])
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Transitions of `steps` steps each, with the memory that belongs to both of their ends."""
+
+    serial: np.ndarray  # int64 (n,) of the rows that they depart from
+    task: np.ndarray  # int64 (n,) positions in `HistoryBuffer.tasks`
+    windows: Windows  # (n, history + n_steps): up to the departure, then onwards; the last row repeated at the end
+    observation: dict[str, np.ndarray]  # (n, size) of every term, at the departure
+    next_observation: dict[str, np.ndarray]  # (n, size) at the arrival
+    action: np.ndarray  # float32 (n, actions) taken at the departure
+    reward: np.ndarray  # float32 (n,) discounted sum over the steps
+    discount: np.ndarray  # float32 (n,) of the arrival's value: γ^steps, 0 where the episode terminated there
+    steps: np.ndarray  # int64 (n,) 1 … n_steps; fewer at the end of an episode
+
+
+TaskName = str | int | None  # None where an environment tells none
+TASK_KEYS = ("task", "track")  # of an `info`: the first that is there names the world's task
+
+
+def task_of(info: Mapping[str, Any]) -> TaskName:
+    """The task that an info tells; None where it tells none."""
+    return next((info[key] for key in TASK_KEYS if key in info), None)
+
+
+class HistoryBuffer:
+    """Flat storage of the steps of many worlds, and an index of the newest transitions of every task."""
+
+    def __init__(
+        self,
+        capacity: int,
+        observation_space: gym.spaces.Dict,
+        action_size: int,
+        num_worlds: int,
+        *,
+        half_precision: Sequence[str] = ("scan",),
+        task_capacity: int | None = None,
+    ) -> None:
+        """Reserve the memory; it is taken as rows come in.
+
+        Args:
+            capacity: rows; an episode of n transitions has n + 1.
+            observation_space: Dict of one-dimensional terms.
+            action_size: numbers in an action.
+            num_worlds: that add a row at each step.
+            half_precision: terms stored as float16 (a range of 30 m to 8 mm).
+            task_capacity: newest transitions of each task that `sample` may draw; None: all that are kept.
+
+        Raises OutlapError for a capacity that cannot hold one transition of each world.
+        """
+        if capacity < 3 * num_worlds:
+            raise OutlapError(
+                f"replay: capacity is {capacity}; {num_worlds} worlds need at least {3 * num_worlds} rows"
+            )
+        self.capacity = capacity
+        self.num_worlds = num_worlds
+        self.task_capacity = task_capacity or capacity
+        self.observation = {
+            name: np.zeros((capacity, *box.shape), np.float16 if name in half_precision else np.float32)  # type: ignore[misc]
+            for name, box in observation_space.spaces.items()
+        }
+        self.action = np.zeros((capacity, action_size), np.float32)
+        self.reward = np.zeros(capacity, np.float32)
+        self.terminated = np.zeros(capacity, bool)
+        self.before = np.full(capacity, NONE)  # serial of the row before in the episode
+        self.after = np.full(capacity, NONE)
+        self.task = np.zeros(capacity, np.int64)
+        self.added = 0  # rows so far: the next serial
+        self.latest = np.full(num_worlds, NONE)  # serial of each world's newest row
+        self.task_now = np.zeros(num_worlds, np.int64)  # of each world
+        self.tasks: list[TaskName] = []
+        self._numbers: dict[TaskName, int] = {}
+        self._departures: list[_Recent] = []  # of every task: rows that have a row after them
+
+    @property
+    def oldest(self) -> int:
+        """Serial of the oldest row that is kept."""
+        return max(0, self.added - self.capacity)
+
+    def transitions(self, task: TaskName = None) -> int:
+        """How many transitions can be drawn, of one task or of all."""
+        which = self._departures if task is None else [self._departures[self._numbers[task]]]
+        return sum(recent.count(self.oldest) for recent in which)
+
+    def begin(self, worlds: np.ndarray, observation: Mapping[str, np.ndarray], tasks: Sequence[TaskName]) -> None:
+        """Add the first row of an episode in some worlds.
+
+        Args:
+            worlds: (n,) their numbers.
+            observation: (n, size) of each term.
+            tasks: of each of these worlds from now on.
+        """
+        for task in tasks:
+            if task not in self._numbers:
+                self._numbers[task] = len(self.tasks)
+                self.tasks.append(task)
+                self._departures.append(_Recent(self.task_capacity))
+        numbers = np.array([self._numbers[task] for task in tasks], np.int64)
+        zero = np.zeros(len(worlds), np.float32)
+        action = np.zeros((len(worlds), self.action.shape[1]), np.float32)
+        self.task_now[worlds] = numbers
+        self._add(np.asarray(worlds), observation, action, zero, zero > 0, np.full(len(worlds), NONE), numbers)
+
+    def add(
+        self,
+        worlds: np.ndarray,
+        observation: Mapping[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+    ) -> None:
+        """Add the next row of some worlds: one transition each.
+
+        Args:
+            worlds: (n,) their numbers; each has begun an episode.
+            observation: (n, size) of each term, that the action led to; an episode's last one too.
+            action: (n, actions).
+            reward: (n,).
+            terminated: bool (n,): the episode is over, and not cut short.
+        """
+        worlds = np.asarray(worlds)
+        before = self.latest[worlds]
+        if (before == NONE).any():
+            raise OutlapError("replay: a world has no episode; call begin first")
+        tasks = self.task_now[worlds]
+        self._add(worlds, observation, action, reward, terminated, before, tasks)
+        kept = before >= self.oldest
+        self.after[before[kept] % self.capacity] = self.latest[worlds[kept]]
+        for number in np.unique(tasks):
+            self._departures[number].extend(np.sort(before[tasks == number]))
+
+    def begin_all(self, env: VecEnv, observation: Mapping[str, np.ndarray]) -> None:
+        """Begin an episode in every world of an environment that was just reset."""
+        self.begin(np.arange(env.num_envs), observation, [task_of(info) for info in env.reset_infos])
+
+    def add_step(
+        self,
+        env: VecEnv,
+        observation: Mapping[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Add what a step of an environment returned; where an episode ended, begin the next.
+
+        Args:
+            env: that was stepped.
+            observation: (worlds, size) of each term, the next episode's first one where one ended.
+            action: (worlds, actions) in [-1, 1].
+            reward, dones, infos: as the environment returned them.
+        """
+        arrived = {name: np.array(value) for name, value in observation.items()}
+        terminated = np.zeros(len(dones), bool)
+        over = np.flatnonzero(dones)
+        for world in over.tolist():
+            for name, value in infos[world]["terminal_observation"].items():
+                arrived[name][world] = value
+            terminated[world] = not infos[world].get("TimeLimit.truncated", False)
+        self.add(np.arange(len(dones)), arrived, action, reward, terminated)
+        if len(over):
+            first = {name: value[over] for name, value in observation.items()}
+            self.begin(over, first, [task_of(env.reset_infos[world]) for world in over.tolist()])
+
+    def sample(self, n: int, rng: np.random.Generator, *, by_task: bool = False) -> np.ndarray:
+        """Draw transitions: serials int64 (n,) of the rows that they depart from, for `gather`.
+
+        Args:
+            n: how many.
+            rng: draws them.
+            by_task: every task as likely as any other, and within it every transition; otherwise every transition.
+
+        Raises OutlapError where there is none.
+        """
+        counts = np.array([recent.count(self.oldest) for recent in self._departures])
+        if not counts.sum():
+            raise OutlapError("replay: holds no transition yet")
+        chances = (counts > 0) / (counts > 0).sum() if by_task else counts / counts.sum()
+        of_task = rng.multinomial(n, chances)
+        drawn = [recent.draw(k, rng, self.oldest) for recent, k in zip(self._departures, of_task, strict=True) if k]
+        return np.concatenate(drawn)
+
+    def windows(self, serial: np.ndarray, length: int, terms: Sequence[str]) -> Windows:
+        """The last `length` rows of an episode up to and with each of some rows.
+
+        Args:
+            serial: (n,) of rows that are kept.
+            length: rows of a window.
+            terms: of the observation that are wanted.
+        """
+        return self._read(self._walk_back(serial, length), terms)
+
+    def gather(
+        self, serial: np.ndarray, *, history: int, n_steps: int = 1, gamma: float = 0.99, terms: Sequence[str] = ()
+    ) -> Batch:
+        """Transitions with their windows.
+
+        Args:
+            serial: (n,) from `sample`.
+            history: rows of a window.
+            n_steps: steps that a transition spans, fewer where the episode ends or nothing newer is there.
+            gamma: discount of a step.
+            terms: of the observation that the windows hold.
+        """
+        n = len(serial)
+        path = np.full((n, history + n_steps), NONE)
+        path[:, :history] = self._walk_back(serial, history)
+        steps = np.zeros(n, np.int64)
+        reward = np.zeros(n)
+        here = np.asarray(serial)
+        for column in range(history, history + n_steps):
+            after = self.after[here % self.capacity]
+            goes_on = after != NONE
+            here = np.where(goes_on, after, here)
+            path[:, column] = here
+            reward += np.where(goes_on, gamma ** (column - history) * self.reward[here % self.capacity], 0.0)
+            steps += goes_on
+        first, last = np.asarray(serial) % self.capacity, here % self.capacity
+        windows = self._read(path, terms)
+        each = np.arange(n)
+        arrival = history - 1 + steps
+        return Batch(
+            serial=np.asarray(serial),
+            task=self.task[first],
+            windows=windows,
+            observation={
+                name: windows.observation[name][:, history - 1] if name in terms else _floats(column[first])
+                for name, column in self.observation.items()
+            },
+            next_observation={
+                name: windows.observation[name][each, arrival] if name in terms else _floats(column[last])
+                for name, column in self.observation.items()
+            },
+            action=windows.action[:, history],
+            reward=reward.astype(np.float32),
+            discount=np.where(self.terminated[last], 0.0, gamma**steps).astype(np.float32),
+            steps=steps,
+        )
+
+    def _walk_back(self, serial: np.ndarray, length: int) -> np.ndarray:
+        """Serials (n, length) of the rows that lead to some rows; NONE before the episode or the ring began."""
+        path = np.full((len(serial), length), NONE)
+        here = np.asarray(serial)
+        for column in reversed(range(length)):
+            path[:, column] = here
+            before = np.where(here == NONE, NONE, self.before[here % self.capacity])
+            here = np.where(before >= self.oldest, before, NONE)
+        return path
+
+    def _read(self, path: np.ndarray, terms: Sequence[str]) -> Windows:
+        rows = path % self.capacity
+        missing = path == NONE
+        action, reward = self.action[rows], self.reward[rows]
+        action[missing] = 0.0
+        reward[missing] = 0.0
+        observation = {}
+        for name in terms:
+            values = self.observation[name].take(rows, axis=0)
+            values[missing] = 0.0
+            observation[name] = values
+        return Windows(observation, action, reward, ~missing)
+
+    def _add(self, worlds, observation, action, reward, terminated, before, tasks) -> None:
+        serial = self.added + np.arange(len(worlds))
+        rows = serial % self.capacity
+        for name, column in self.observation.items():
+            column[rows] = observation[name]
+        self.action[rows] = action
+        self.reward[rows] = reward
+        self.terminated[rows] = terminated
+        self.before[rows] = before
+        self.after[rows] = NONE
+        self.task[rows] = tasks
+        self.latest[worlds] = serial
+        self.added += len(worlds)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write all that is kept, the rows in use only; a kill leaves the old file or the new one. No pickle."""
+        used = min(self.added, self.capacity)
+        arrays = {name: getattr(self, name)[:used] for name in ROW_FIELDS}
+        arrays |= {f"observation/{name}": column[:used] for name, column in self.observation.items()}
+        arrays |= {"latest": self.latest, "task_now": self.task_now}
+        facts = {
+            "capacity": self.capacity,
+            "task_capacity": self.task_capacity,
+            "added": self.added,
+            "tasks": self.tasks,
+            "departures": [(recent.added, recent.ascending) for recent in self._departures],
+        }
+        for number, recent in enumerate(self._departures):
+            arrays[f"departures/{number}"] = recent.ring[: min(recent.added, len(recent.ring))]
+        arrays["facts"] = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        try:
+            with partial.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+        return path
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> HistoryBuffer:
+        """Read what `save` wrote; runs no code from the file. Raises OutlapError where it is missing or broken."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+            facts = json.loads(arrays.pop("facts").tobytes())
+            buffer = cls.__new__(cls)
+            buffer.capacity, buffer.task_capacity = int(facts["capacity"]), int(facts["task_capacity"])
+            buffer.added = int(facts["added"])
+            buffer.latest, buffer.task_now = arrays["latest"], arrays["task_now"]
+            buffer.num_worlds = len(buffer.latest)
+            buffer.tasks = facts["tasks"]
+            buffer._numbers = {task: number for number, task in enumerate(buffer.tasks)}
+            buffer.observation = {
+                name.removeprefix("observation/"): _grown(column, buffer.capacity)
+                for name, column in arrays.items()
+                if name.startswith("observation/")
+            }
+            for name in ROW_FIELDS:
+                setattr(buffer, name, _grown(arrays[name], buffer.capacity))
+            buffer._departures = []
+            for number, (added, ascending) in enumerate(facts["departures"]):
+                recent = _Recent(buffer.task_capacity)
+                recent.ring, recent.added, recent.ascending = (
+                    arrays[f"departures/{number}"],
+                    int(added),
+                    bool(ascending),
+                )
+                buffer._departures.append(recent)
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise OutlapError(f"{path}: cannot be read as a replay: {error}") from None
+        return buffer
+
+
+ROW_FIELDS = ("action", "reward", "terminated", "before", "after", "task")
+
+
+class _Recent:
+    """The newest serials of one task."""
+
+    def __init__(self, capacity: int) -> None:
+        self.ring = np.zeros(min(64, capacity), np.int64)
+        self.capacity = capacity
+        self.added = 0
+        self.ascending = True  # as they come where all worlds step together: then the oldest are found by halves
+
+    def extend(self, serials: np.ndarray) -> None:
+        needed = min(self.added + len(serials), self.capacity)
+        if needed > len(self.ring):  # only ever before the ring has turned over
+            self.ring = _grown(self.ring, min(max(needed, 2 * len(self.ring)), self.capacity))
+        if self.added and serials[0] < self.ring[(self.added - 1) % len(self.ring)]:
+            self.ascending = False
+        self.ring[(self.added + np.arange(len(serials))) % len(self.ring)] = serials
+        self.added += len(serials)
+
+    def count(self, oldest: int) -> int:
+        """How many there are from `oldest` on."""
+        return self.added - self._first(oldest) if self.ascending else int((self._held() >= oldest).sum())
+
+    def draw(self, n: int, rng: np.random.Generator, oldest: int) -> np.ndarray:
+        """`n` of those from `oldest` on."""
+        if self.ascending:
+            return self.ring[rng.integers(self._first(oldest), self.added, n) % len(self.ring)]
+        held = self._held()
+        return rng.choice(held[held >= oldest], n)
+
+    def _held(self) -> np.ndarray:
+        return self.ring[: min(self.added, len(self.ring))]
+
+    def _first(self, oldest: int) -> int:
+        low, high = max(0, self.added - len(self.ring)), self.added
+        while low < high:  # by halves, over the ring as it was filled
+            middle = (low + high) // 2
+            if self.ring[middle % len(self.ring)] < oldest:
+                low = middle + 1
+            else:
+                high = middle
+        return low
+
+
+def _grown(rows: np.ndarray, capacity: int) -> np.ndarray:
+    grown = np.zeros((capacity, *rows.shape[1:]), rows.dtype)
+    grown[: len(rows)] = rows
+    return grown
+
+
+def _floats(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32, copy=False)

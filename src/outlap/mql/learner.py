@@ -1,0 +1,145 @@
+"""One TD3 update of a context-conditioned policy (Fujimoto et al., 2018), with a weight for every transition."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from outlap.mql.buffers import Batch
+from outlap.mql.policies import MQLPolicy, _tensor
+
+
+@dataclass(frozen=True)
+class TD3Settings:
+    """Constants of an update."""
+
+    tau: float = 0.005  # share of the targets' move towards the networks
+    policy_noise: float = 0.2  # standard deviation of the target action's noise
+    noise_clip: float = 0.5  # largest such noise
+    policy_delay: int = 2  # updates of the critics for one of the actor and the targets
+    max_grad_norm: float = 10.0
+
+
+def td3_update(
+    policy: MQLPolicy,
+    batch: Batch,
+    settings: TD3Settings,
+    noise: torch.Generator,
+    *,
+    update_actor: bool,
+    weights: Tensor | None = None,
+    anchor: list[Tensor] | None = None,
+    anchor_weight: float = 0.0,
+) -> dict[str, Tensor]:
+    """Change the policy by one batch: the critics, the context encoder and, if asked, actor and targets.
+
+    The context is computed once. Both losses reach its encoder: the critics' directly, the actor's through the
+    action that it chose; what the critics see of the context in the actor's loss is held fixed.
+
+    Args:
+        policy: to change.
+        batch: transitions.
+        settings: constants.
+        noise: draws the noise of the target actions.
+        update_actor: whether this is an update of the actor and the targets too.
+        weights: (n,) of the transitions in both losses; none: 1 each.
+        anchor: values of `policy.adapted_parameters()` that the proximal term holds them to.
+        anchor_weight: λ of the proximal term λ‖θ - anchor‖².
+
+    Returns:
+        What can be logged, without gradient: losses, the variance of the transitions' losses, the mean of Q, the
+        distance ‖θ - anchor‖².
+    """
+    device = policy.device
+    action, reward, discount = (_tensor(x, device) for x in (batch.action, batch.reward, batch.discount))
+    seen = {name: _tensor(batch.observation[name], device) for name in policy.critic.encoder.encoders}
+    seen_next = {name: _tensor(batch.next_observation[name], device) for name in policy.critic.encoder.encoders}
+    context, context_next = _contexts(policy, batch)
+
+    with torch.no_grad():
+        embedding_next = policy.critic_target.encoder(seen_next)
+        shared = policy.shares_encoder
+        chosen = policy.actor_target(embedding_next if shared else policy.actor_target.encoder(seen_next), context_next)
+        jitter = torch.randn(chosen.shape, generator=noise, device=device) * settings.policy_noise
+        chosen = (chosen + jitter.clamp(-settings.noise_clip, settings.noise_clip)).clamp(-1.0, 1.0)
+        target = reward + discount * policy.critic_target(embedding_next, chosen, context_next).amin(0)
+
+    embedding = policy.critic.encoder(seen)
+    values = policy.critic(embedding, action, context)
+    each = (values - target).square().sum(0)
+    critic_loss = (each if weights is None else weights * each).mean()
+    loss = critic_loss
+    record = {}
+    if update_actor:
+        seen_by_actor = embedding.detach() if shared else policy.actor.encoder(seen)
+        with _frozen(policy.critic.heads):
+            value = policy.critic(embedding.detach(), policy.actor(seen_by_actor, context), context.detach())[0]
+        actor_loss = -(value if weights is None else weights * value).mean()
+        loss = loss + actor_loss
+        record["actor_loss"] = actor_loss.detach()
+    if anchor is not None:
+        distance = sum((p - at).square().sum() for p, at in zip(policy.adapted_parameters(), anchor, strict=True))
+        assert isinstance(distance, Tensor)
+        loss = loss + anchor_weight * distance
+        record["anchor_distance"] = distance.detach()
+
+    policy.critic_optimizer.zero_grad()
+    policy.actor_optimizer.zero_grad()
+    loss.backward()
+    grad_norm = nn.utils.clip_grad_norm_(policy.critic_optimizer.param_groups[0]["params"], settings.max_grad_norm)
+    policy.critic_optimizer.step()
+    if update_actor:
+        nn.utils.clip_grad_norm_(policy.actor_optimizer.param_groups[0]["params"], settings.max_grad_norm)
+        policy.actor_optimizer.step()
+        with torch.no_grad():
+            pairs = list(zip(policy.critic_target.parameters(), policy.critic.parameters(), strict=True))
+            ours, theirs = (
+                (policy.actor_target.head, policy.actor.head) if shared else (policy.actor_target, policy.actor)
+            )
+            pairs += zip(ours.parameters(), theirs.parameters(), strict=True)
+            for target, new in pairs:
+                target.lerp_(new, settings.tau)
+    weighted = each.detach() if weights is None else weights * each.detach()
+    return {
+        "critic_loss": critic_loss.detach(),
+        "critic_loss_variance": weighted.var(),
+        "td_error": each.detach().mean(),
+        "q_value": values.detach().mean(),
+        "grad_norm": grad_norm.detach(),
+        **record,
+    }
+
+
+def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:
+    """z where the transitions depart, and, without gradient, where they arrive."""
+    n, length = policy.history, batch.windows.action.shape[1]
+    if not policy.uses_context:
+        zero = torch.zeros(len(batch.action), policy.context.hidden, device=policy.device)
+        return zero, zero
+    steps, valid = policy.steps(batch.windows)
+    projected = policy.context.project(steps)  # once, for windows that share all rows but the ends
+    departing = policy.context(projected[:, :n], valid[:, :n])
+    with torch.no_grad():
+        if length == n + 1:
+            arriving = policy.context(projected[:, 1:], valid[:, 1:])
+        else:
+            rows = torch.as_tensor(batch.steps, device=policy.device)[:, None] + torch.arange(n, device=policy.device)
+            each = torch.arange(len(rows), device=policy.device)[:, None]
+            arriving = policy.context(projected[each, rows], valid[each, rows])
+    return departing, arriving
+
+
+@contextmanager
+def _frozen(module: nn.Module) -> Iterator[None]:
+    """Without gradients for a module's own parameters."""
+    for parameter in module.parameters():
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in module.parameters():
+            parameter.requires_grad_(True)

@@ -1,0 +1,205 @@
+"""The networks of Meta-Q-Learning. A preset is one class; another one is one class more, named in `PRESETS`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import gymnasium as gym
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from outlap.mql.gru import GRULayer
+
+PREVIOUS_REWARD = "previous_reward"  # the observation term that the context takes the reward from
+
+
+class ContextEncoder(nn.Module):
+    """A GRU over a window of (action, reward, observation): what the last steps tell of the task.
+
+    Before an episode's start the hidden state stays 0. Written out, and not `nn.GRU`, so that the projection of
+    the inputs, most of the work, is made once for windows that overlap.
+    """
+
+    def __init__(self, inputs: int, hidden: int, layers: int) -> None:
+        super().__init__()
+        self.hidden = hidden
+        self.inputs = nn.ModuleList(nn.Linear(inputs if i == 0 else hidden, 3 * hidden) for i in range(layers))
+        self.recurrent = nn.ModuleList(nn.Linear(hidden, 3 * hidden) for _ in range(layers))
+        for parameter in self.parameters():
+            nn.init.uniform_(parameter, -1.0 / math.sqrt(hidden), 1.0 / math.sqrt(hidden))
+
+    def project(self, steps: Tensor) -> Tensor:
+        """The first layer's share of the inputs: (n, length, inputs) → (n, length, 3 hidden)."""
+        return self.inputs[0](steps)
+
+    def forward(self, projected: Tensor, valid: Tensor) -> Tensor:
+        """The context z (n, hidden) after the last step.
+
+        Args:
+            projected: (n, length, 3 hidden) from `project`.
+            valid: (n, length), 0 before the episode's start and 1 after.
+        """
+        steps, mask = projected.transpose(0, 1), valid.t().unsqueeze(-1)
+        for layer, recurrent in enumerate(self.recurrent):
+            if layer:
+                steps = self.inputs[layer](steps)
+            steps = GRULayer.apply(steps, mask, recurrent.weight, recurrent.bias)
+        return steps[-1]
+
+
+class ObservationEncoder(nn.Module):
+    """One encoder a term, side by side."""
+
+    def __init__(self, encoders: Mapping[str, nn.Module]) -> None:
+        super().__init__()
+        self.encoders = nn.ModuleDict(encoders)
+
+    def forward(self, observation: Mapping[str, Tensor]) -> Tensor:
+        """(n, size) of each term → (n, sum of the encoders' sizes)."""
+        return torch.cat([encoder(observation[name]) for name, encoder in self.encoders.items()], -1)
+
+
+class ScanConvolution(nn.Module):
+    """A 1-D convolution over neighbouring beams, then one layer: (n, beams) → (n, size)."""
+
+    def __init__(self, beams: int, size: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv1d(1, 16, 7, stride=4, padding=3), nn.ReLU(),
+            nn.Conv1d(16, 16, 5, stride=2, padding=2), nn.ReLU(), nn.Flatten(),
+        )  # fmt: skip
+        with torch.no_grad():
+            flat = self.layers(torch.zeros(1, 1, beams)).shape[1]
+        self.last = nn.Sequential(nn.Linear(flat, size), nn.ReLU())
+
+    def forward(self, scan: Tensor) -> Tensor:
+        return self.last(self.layers(scan.unsqueeze(1)))
+
+
+class TwinMLP(nn.Module):
+    """Two networks of one shape side by side, as one batched product: (n, inputs) → (2, n)."""
+
+    def __init__(self, inputs: int, hidden: Sequence[int], layer_norm: bool) -> None:
+        super().__init__()
+        sizes = [inputs, *hidden, 1]
+        self.weights = nn.ParameterList(nn.Parameter(torch.empty(2, a, b)) for a, b in pairwise(sizes))
+        self.biases = nn.ParameterList(nn.Parameter(torch.empty(2, 1, b)) for b in sizes[1:])
+        self.layer_norm = layer_norm
+        for a, weight, bias in zip(sizes, self.weights, self.biases, strict=False):
+            nn.init.uniform_(weight, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
+            nn.init.uniform_(bias, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x.expand(2, *x.shape)
+        last = len(self.weights) - 1
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
+            if i < last:
+                if self.layer_norm:
+                    x = functional.layer_norm(x, x.shape[-1:])
+                x = torch.relu(x)
+        return x.squeeze(-1)
+
+
+class Actor(nn.Module):
+    """What it sees and the context → an action in [-1, 1]."""
+
+    def __init__(self, encoder: ObservationEncoder, head: nn.Module) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.head = head
+
+    def forward(self, embedding: Tensor, context: Tensor) -> Tensor:
+        return torch.tanh(self.head(torch.cat([embedding, context], -1)))
+
+
+class Critic(nn.Module):
+    """What it sees, an action and the context → two estimates of the return, (2, n)."""
+
+    def __init__(self, encoder: ObservationEncoder, heads: TwinMLP) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.heads = heads
+
+    def forward(self, embedding: Tensor, action: Tensor, context: Tensor) -> Tensor:
+        return self.heads(torch.cat([embedding, action, context], -1))
+
+
+class Preset:
+    """How the networks are built; the class attributes are what presets differ in."""
+
+    history = 10  # steps that the context is made of
+    context_hidden = 128
+    context_layers = 2
+    hidden: tuple[int, ...] = (256, 256)  # of actor and critics
+    layer_norm = False  # in the critics
+    shared_encoder = False  # actor, critics and context see through one encoder, which the critics' loss trains
+
+    def context_terms(self, space: gym.spaces.Dict) -> tuple[str, ...]:
+        """The observation terms that the context is made of, PREVIOUS_REWARD aside."""
+        return tuple(name for name in space.spaces if name != PREVIOUS_REWARD)
+
+    def term_encoder(self, name: str, size: int) -> tuple[nn.Module, int]:
+        """The encoder of a term of `size` numbers, and how many numbers it gives."""
+        width = 128 if name == "scan" else 64
+        return nn.Sequential(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()), width
+
+    def build(self, space: gym.spaces.Dict, actions: int, uses_reward: bool) -> tuple[ContextEncoder, Actor, Critic]:
+        """The networks for observations of `space`, which hold PREVIOUS_REWARD for the context alone."""
+        sizes = {name: int(box.shape[0]) for name, box in space.spaces.items()}  # type: ignore[index]
+
+        def encoder() -> tuple[ObservationEncoder, dict[str, int]]:
+            built = {name: self.term_encoder(name, size) for name, size in sizes.items() if name != PREVIOUS_REWARD}
+            widths = {name: width for name, (_, width) in built.items()}
+            return ObservationEncoder({name: module for name, (module, _) in built.items()}), widths
+
+        critic_encoder, widths = encoder()
+        actor_encoder = critic_encoder if self.shared_encoder else encoder()[0]
+        of_term = widths if self.shared_encoder else sizes
+        step = actions + int(uses_reward) + sum(of_term[name] for name in self.context_terms(space))
+        context = ContextEncoder(step, self.context_hidden, self.context_layers)
+        seen = sum(widths.values()) + self.context_hidden
+        actor = Actor(actor_encoder, _mlp(seen, self.hidden, actions))
+        critic = Critic(critic_encoder, TwinMLP(seen + actions, self.hidden, self.layer_norm))
+        return context, actor, critic
+
+
+class Paper(Preset):
+    """The networks of the paper: its GRU reads whole observations as they are."""
+
+
+class Fast(Preset):
+    """For two cores: scans by convolution, a small GRU over embedded proprioception, LayerNorm critics.
+
+    What tells one vehicle from another is in a few numbers: how it moved and steered. Scans stay out of the context.
+    """
+
+    context_hidden = 64
+    context_layers = 1
+    layer_norm = True
+    shared_encoder = True
+
+    def context_terms(self, space: gym.spaces.Dict) -> tuple[str, ...]:
+        """All but scan and pose, unless there is nothing else."""
+        names = super().context_terms(space)
+        return tuple(name for name in names if name not in ("scan", "pose")) or names
+
+    def term_encoder(self, name: str, size: int) -> tuple[nn.Module, int]:
+        if name == "scan" and size >= 16:
+            return ScanConvolution(size, 128), 128
+        width = 128 if name == "scan" else 32
+        return nn.Sequential(nn.Linear(size, width), nn.ReLU()), width
+
+
+PRESETS: dict[str, type[Preset]] = {"paper": Paper, "fast": Fast}
+
+
+def _mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    sizes = [inputs, *hidden]
+    layers: list[nn.Module] = []
+    for a, b in pairwise(sizes):
+        layers += [nn.Linear(a, b), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))

@@ -1,0 +1,86 @@
+"""Meta-training with Meta-Q-Learning on the batched environment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from outlap.envs.race_config import RaceConfig
+from outlap.training.ppo import PPOConfig
+from outlap.training.session import TrainingConfig
+
+if TYPE_CHECKING:
+    from outlap.envs.sb3_vec_env import SB3VecEnv
+    from outlap.mql.mql import MQL
+
+
+class MQLConfig(TrainingConfig):
+    """A meta-training. The defaults are for two cores; `--preset paper` has the paper's networks."""
+
+    algorithm: Literal["mql"] = "mql"  # type: ignore[assignment] - narrower than the base class's
+    env: RaceConfig = PPOConfig().env.model_copy(
+        update={"observation": ("scan", "vel", "heading", "previous_action", "previous_reward")}
+    )
+    total_steps: int = Field(default=1_500_000, gt=0)  # actions, all worlds together
+    learning_rate: float = Field(default=5e-4, gt=0)
+    preset: Literal["fast", "paper"] = "fast"  # networks, see mql.networks
+    history: int = Field(default=10, ge=1)  # steps that the context is made of
+    uses_reward: bool = True  # whether the context is told the rewards, which a car does not have
+    uses_context: bool = True  # without it, it is TD3
+    buffer_size: int = Field(default=1_000_000, ge=1)  # steps, all worlds together
+    learning_starts: int = Field(default=20_000, ge=0)  # actions at random before the first update
+    batch_size: int = Field(default=512, ge=2)
+    updates_per_step: int = Field(default=1, ge=1)  # for every action of all worlds
+    n_steps: int = Field(default=3, ge=1)  # of a return
+    gamma: float = Field(default=0.99, gt=0, le=1)
+    tau: float = Field(default=0.005, gt=0, le=1)
+    exploration_noise: float = Field(default=0.15, ge=0)
+    policy_noise: float = Field(default=0.2, ge=0)
+    noise_clip: float = Field(default=0.5, ge=0)
+    policy_delay: int = Field(default=2, ge=1)
+
+    @property
+    def report_every(self) -> int:
+        """See `TrainingConfig`; a rollout is one action of all worlds."""
+        return 32 * self.num_envs
+
+    @property
+    def log_interval(self) -> int:
+        """See `TrainingConfig`: episodes."""
+        return self.num_envs
+
+    def make_model(self, environment: SB3VecEnv) -> MQL:
+        """See `TrainingConfig`."""
+        from outlap.mql.mql import MQL
+
+        return MQL(
+            "MQLPolicy",
+            environment,  # type: ignore[arg-type]
+            learning_rate=self.schedule(),
+            buffer_size=self.buffer_size,
+            learning_starts=self.learning_starts,
+            batch_size=self.batch_size,
+            tau=self.tau,
+            gamma=self.gamma,
+            gradient_steps=self.updates_per_step,
+            n_steps=self.n_steps,
+            exploration_noise=self.exploration_noise,
+            policy_noise=self.policy_noise,
+            noise_clip=self.noise_clip,
+            policy_delay=self.policy_delay,
+            policy_kwargs={
+                "preset": self.preset,
+                "history": self.history,
+                "uses_reward": self.uses_reward,
+                "uses_context": self.uses_context,
+            },
+            seed=self.seed,
+            device=self.device,
+        )
+
+    def model_class(self) -> type[MQL]:
+        """See `TrainingConfig`."""
+        from outlap.mql.mql import MQL
+
+        return MQL

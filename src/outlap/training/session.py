@@ -1,0 +1,243 @@
+"""A training session: what every algorithm has in common, from the first folder to the finished policy."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field
+
+from outlap.config import Config
+from outlap.envs.race_config import RaceConfig
+from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
+from outlap.envs.terminations import CRASH
+from outlap.training.run import Run, create_run, save_checkpoint
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from outlap.envs.sb3_vec_env import SB3VecEnv
+
+RECENT_EPISODES = 500  # over which training statistics are taken
+
+
+class TrainingConfig(Config):
+    """A training. Each algorithm has its own, named by the field `algorithm`."""
+
+    algorithm: str
+    env: RaceConfig = RaceConfig()
+    held_out_tracks: tuple[str, ...] = ()  # what `outlap evaluate` takes by default; refused if also trained on
+    total_steps: int = Field(default=2_000_000, gt=0)  # actions, all worlds together
+    num_envs: int = Field(default=128, ge=1)
+    seed: int = Field(default=0, ge=0)
+    learning_rate: float = Field(default=5e-4, gt=0)
+    learning_rate_decay: bool = True  # linearly to zero at total_steps
+    device: str = "cpu"
+    threads: int = Field(default=0, ge=0)  # of PyTorch; 0 = one a core
+    checkpoint_every: int = Field(default=250_000, gt=0)  # actions
+
+    @abstractmethod
+    def make_model(self, environment: SB3VecEnv) -> BaseAlgorithm:
+        """A model that has learnt nothing yet."""
+
+    @abstractmethod
+    def model_class(self) -> type[BaseAlgorithm]:
+        """What `load` reads back a model with."""
+
+    @property
+    def report_every(self) -> int:
+        """Actions between two reports of progress, at the end of a rollout."""
+        return 0
+
+    @property
+    def log_interval(self) -> int:
+        """Of `learn`: between two lines of the log, in the algorithm's own count."""
+        return 1
+
+    def schedule(self) -> Callable[[float], float] | float:
+        """The learning rate as a function of the progress remaining, 1 … 0."""
+        rate = self.learning_rate
+        return (lambda remaining: rate * remaining) if self.learning_rate_decay else rate
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How a training stands, for whoever shows it."""
+
+    steps: int
+    total_steps: int
+    steps_per_second: float
+    crash_rate: float | None  # of recent episodes
+    mean_speed_mps: float | None
+    progress_m: float | None
+
+
+class Stopwatch:
+    """Seconds of a training, those of earlier sessions included."""
+
+    def __init__(self, before: float) -> None:
+        self._start = time.monotonic() - before
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._start
+
+
+def train(
+    config: TrainingConfig,
+    folder: Path,
+    *,
+    resume: Run | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Run:
+    """Train, writing checkpoints and logs to a run folder; returns the finished run.
+
+    Args:
+        config: what to train.
+        folder: where; must not hold a run, unless it is `resume`'s.
+        resume: a run to continue from its newest checkpoint; one that is finished is handed back.
+        on_progress: called at the end of a rollout, see `TrainingConfig.report_every`.
+
+    Raises OutlapError for a track that cannot be loaded, a folder that holds a run. A KeyboardInterrupt
+    passes through once a checkpoint is written.
+    """
+    if resume is not None and resume.finished:
+        return resume
+    import torch
+    from stable_baselines3.common.logger import configure
+
+    from outlap.envs.sb3_vec_env import SB3VecEnv
+
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    # Everything that can be wrong with the configuration is found here, before the folder is made.
+    environment = SB3VecEnv(config.num_envs, **dict(config.env))
+    if config.held_out_tracks:
+        TaskSplit(environment.env.tasks, TaskSet(load_tracks(config.held_out_tracks)))
+    model = None if resume else config.make_model(environment)
+    run = resume or create_run(folder, config)
+    if resume:
+        run.begin_session()
+        model = _newest_model(run, environment, config) or config.make_model(environment)
+    assert model is not None
+    run.write_record(tracks={track.name: track.fingerprint for track in environment.env.tasks.tracks})
+    begun_at = model.num_timesteps
+    environment.env.training_steps = begun_at
+    # A resumed run must not race the episodes again that it has raced before.
+    environment.seed(int(np.random.SeedSequence([config.seed, begun_at]).generate_state(1)[0]))
+    model.set_logger(configure(str(run.folder / "tensorboard"), ["tensorboard"]))
+    clock = Stopwatch(float(run.record().get("seconds", 0.0)) if begun_at else 0.0)
+    try:
+        if begun_at < config.total_steps:
+            model.learn(
+                config.total_steps - begun_at,
+                callback=_watcher(run, config, clock, on_progress),
+                log_interval=config.log_interval,
+                reset_num_timesteps=begun_at == 0,
+            )
+    except KeyboardInterrupt:
+        _save(run, model, clock)
+        raise
+    _save_replay(run, model)
+    save_checkpoint(run, model, "policy.zip")
+    run.note_pace(
+        model.num_timesteps,
+        clock.seconds,
+        finished=True,
+        compile_seconds=environment.env.race.simulator.compile_seconds,
+    )
+    return run
+
+
+def _save(run: Run, model: Any, clock: Stopwatch) -> None:
+    """A checkpoint; the replay first, so that none is without one."""
+    _save_replay(run, model)
+    save_checkpoint(run, model, f"checkpoints/step_{model.num_timesteps:09d}.zip")
+    run.note_pace(model.num_timesteps, clock.seconds)
+
+
+def _save_replay(run: Run, model: Any) -> None:
+    replay = getattr(model, "replay_buffer", None)
+    if replay is not None:
+        replay.save(run.replay_path)
+
+
+def _newest_model(run: Run, environment, config: TrainingConfig):
+    """The newest checkpoint that can be read, or None."""
+    for path in run.checkpoints():
+        try:
+            model = config.model_class().load(path, env=environment, device=config.device)
+        except Exception as error:  # whatever a broken file raises: the one before may be whole
+            run.write_record(**{f"unreadable_{path.name}": str(error)})
+            continue
+        if run.replay_path.exists():
+            model.load_replay_buffer(run.replay_path)  # type: ignore[attr-defined]
+        return model
+    return None
+
+
+def _watcher(run: Run, config: TrainingConfig, clock: Stopwatch, on_progress: Callable[[Progress], None] | None):
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Watcher(BaseCallback):
+        """Logs episodes by outcome and reward term; writes checkpoints; reports progress."""
+
+        def _on_training_start(self) -> None:
+            self.episodes: deque[dict] = deque(maxlen=RECENT_EPISODES)
+            self.saved_at = self.model.num_timesteps
+            self.reported_at = self.model.num_timesteps
+
+        def _on_step(self) -> bool:
+            self.episodes.extend(info for info in self.locals["infos"] if "episode" in info)
+            return True
+
+        def _on_rollout_start(self) -> None:
+            # Here, and not where a rollout ends: by now the policy has learnt from all that it has seen.
+            if self.model.num_timesteps - self.saved_at >= config.checkpoint_every:
+                _save(run, self.model, clock)
+                self.saved_at = self.model.num_timesteps
+
+        def _on_rollout_end(self) -> None:
+            if self.model.num_timesteps - self.reported_at < config.report_every:
+                return
+            self.reported_at = self.model.num_timesteps
+            numbers = {
+                name: float(np.mean([episode[name] for episode in self.episodes]))
+                for name in (
+                    "progress_m",
+                    "mean_speed_mps",
+                    "completed_laps",
+                    "episode_return",
+                    *self._terms(),
+                )
+                if self.episodes
+            }
+            for name, number in numbers.items():
+                self.logger.record(f"race/{name}", number)
+            crash_rate = None
+            if self.episodes:
+                crash_rate = float(np.mean([episode["outcome"] == CRASH for episode in self.episodes]))
+                self.logger.record("race/crash_rate", crash_rate)
+            steps = self.model.num_timesteps
+            if on_progress is not None:
+                on_progress(
+                    Progress(
+                        steps=steps,
+                        total_steps=config.total_steps,
+                        steps_per_second=steps / clock.seconds,
+                        crash_rate=crash_rate,
+                        mean_speed_mps=numbers.get("mean_speed_mps"),
+                        progress_m=numbers.get("progress_m"),
+                    )
+                )
+
+        def _terms(self) -> list[str]:
+            return [name for name in self.episodes[-1] if name.startswith("reward_")] if self.episodes else []
+
+    return Watcher()

@@ -1,0 +1,165 @@
+"""One update: against a plain TD3 step, and where its gradients go."""
+
+from __future__ import annotations
+
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.learner import TD3Settings, td3_update
+from outlap.mql.policies import MQLPolicy, _tensor
+
+SPACE = gym.spaces.Dict(
+    {
+        "scan": gym.spaces.Box(0.0, 30.0, (20,), np.float32),
+        "vel": gym.spaces.Box(-9.0, 9.0, (3,), np.float32),
+        "previous_reward": gym.spaces.Box(-9.0, 9.0, (1,), np.float32),
+    }
+)
+ACTIONS = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+STILL = TD3Settings(policy_noise=0.0)  # no noise on target actions
+
+
+def replay(n_steps: int = 1):
+    """A batch from some random episodes."""
+    rng = np.random.default_rng(0)
+    buffer = HistoryBuffer(400, SPACE, 2, 4)
+
+    def seen() -> dict[str, np.ndarray]:
+        return {name: rng.normal(size=(4, *box.shape)).astype(np.float32) for name, box in SPACE.spaces.items()}  # type: ignore[misc]
+
+    for episode in range(4):
+        buffer.begin(np.arange(4), seen(), ["a"] * 4)
+        for step in range(12):
+            over = step == 11 and episode % 2 == 0
+            buffer.add(np.arange(4), seen(), rng.uniform(-1, 1, (4, 2)), rng.normal(size=4), np.full(4, over))
+    return buffer.gather(
+        buffer.sample(64, rng), history=5, n_steps=n_steps, gamma=0.9, terms=("scan", "vel", "previous_reward")
+    )
+
+
+def policy(preset: str, **kwargs) -> MQLPolicy:
+    torch.manual_seed(0)
+    made = MQLPolicy(SPACE, ACTIONS, lambda _: 1e-2, preset=preset, history=5, **kwargs)
+    with torch.no_grad():  # targets of their own, so that a mix-up shows
+        for parameter in [*made.actor_target.parameters(), *made.critic_target.parameters()]:
+            parameter.mul_(0.9)
+    return made
+
+
+def use_plain_gradient_descent(p: MQLPolicy) -> None:
+    """In place of Adam, whose first step is the gradient's sign: where that is as good as 0, rounding decides."""
+    p.make_optimizers(1e-2)
+    p.actor_optimizer, p.critic_optimizer = (  # type: ignore[assignment]
+        torch.optim.SGD(optimizer.param_groups[0]["params"], lr=1e-2)
+        for optimizer in (p.actor_optimizer, p.critic_optimizer)
+    )
+
+
+def plain_losses(p: MQLPolicy, batch, n_steps: int):
+    """The TD3 losses, each part computed anew and by itself."""
+
+    def z(columns: torch.Tensor) -> torch.Tensor:
+        steps, valid = p.steps(batch.windows)
+        rows = torch.arange(len(columns))[:, None]
+        return p.context(p.context.project(steps[rows, columns]), valid[rows, columns])
+
+    here = torch.arange(5)[None].expand(len(batch.action), 5)
+    there = here + torch.as_tensor(batch.steps)[:, None]
+    names = p.critic.encoder.encoders
+    now = {name: _tensor(batch.observation[name], p.device) for name in names}
+    then = {name: _tensor(batch.next_observation[name], p.device) for name in names}
+    actor_encoder = p.critic_target.encoder if p.shares_encoder else p.actor_target.encoder
+    action = p.actor_target(actor_encoder(then), z(there).detach())
+    q = p.critic_target(p.critic_target.encoder(then), action, z(there).detach()).min(0).values
+    target = (_tensor(batch.reward, p.device) + _tensor(batch.discount, p.device) * q).detach()
+    values = p.critic(p.critic.encoder(now), _tensor(batch.action, p.device), z(here))
+    each = ((values - target) ** 2).sum(0)
+    mine = p.critic.encoder(now).detach() if p.shares_encoder else p.actor.encoder(now)
+    chosen = p.actor(mine, z(here))
+    value = p.critic(p.critic.encoder(now).detach(), chosen, z(here).detach())[0]
+    return each, value
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize("preset", ["paper", "fast"])
+def test_an_update_is_a_plain_td3_step_of_both_losses(preset: str, n_steps: int) -> None:
+    batch = replay(n_steps)
+    weights = torch.linspace(0.1, 3.0, 64)
+    ours = policy(preset)
+    theirs = copy.deepcopy(ours)
+    for each in (ours, theirs):
+        use_plain_gradient_descent(each)
+    record = td3_update(ours, batch, STILL, torch.Generator(), update_actor=True, weights=weights)
+
+    each, value = plain_losses(theirs, batch, n_steps)
+    critic_loss, actor_loss = (weights * each).mean(), -(weights * value).mean()
+    assert record["critic_loss"].item() == pytest.approx(critic_loss.item(), rel=1e-5)
+    assert record["actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-5)
+    assert record["critic_loss_variance"].item() == pytest.approx((weights * each).var().item(), rel=1e-4)
+    assert record["td_error"].item() == pytest.approx(each.mean().item(), rel=1e-5)
+    critics, context = list(theirs.critic.parameters()), list(theirs.context.parameters())
+    actors = list(theirs.actor_optimizer.param_groups[0]["params"])
+    of_critic = torch.autograd.grad(critic_loss, [*critics, *context], retain_graph=True)
+    of_actor = torch.autograd.grad(actor_loss, [*context, *actors])
+    with torch.no_grad():
+        for parameter, gradient in zip(critics, of_critic[: len(critics)], strict=True):
+            parameter.grad = gradient
+        for i, parameter in enumerate(context):  # both losses reach the context
+            assert of_critic[len(critics) + i].abs().max() > 0
+            assert of_actor[i].abs().max() > 0
+            parameter.grad = of_critic[len(critics) + i] + of_actor[i]
+        for parameter, gradient in zip(actors, of_actor[len(context) :], strict=True):
+            parameter.grad = gradient
+    torch.nn.utils.clip_grad_norm_([*critics, *context], STILL.max_grad_norm)
+    torch.nn.utils.clip_grad_norm_(actors, STILL.max_grad_norm)
+    theirs.critic_optimizer.step()
+    theirs.actor_optimizer.step()
+    for mine, other in zip(ours.adapted_parameters(), theirs.adapted_parameters(), strict=True):
+        torch.testing.assert_close(mine, other)
+
+
+def test_targets_follow_slowly_and_only_with_the_actor() -> None:
+    p = policy("fast")
+    before = copy.deepcopy(p)
+    td3_update(p, replay(), STILL, torch.Generator(), update_actor=False)
+    for now, then in zip(p.critic_target.parameters(), before.critic_target.parameters(), strict=True):
+        assert torch.equal(now, then)
+    for now, then in zip(p.actor.head.parameters(), before.actor.head.parameters(), strict=True):
+        assert torch.equal(now, then)
+    td3_update(p, replay(), STILL, torch.Generator(), update_actor=True)
+    pairs = [*zip(p.critic_target.parameters(), before.critic_target.parameters(), p.critic.parameters(), strict=True)]
+    pairs += zip(
+        p.actor_target.head.parameters(), before.actor_target.head.parameters(), p.actor.head.parameters(), strict=True
+    )
+    for now, then, network in pairs:
+        torch.testing.assert_close(now, then + STILL.tau * (network - then))
+
+
+def test_the_proximal_term_pulls_towards_its_anchor() -> None:
+    p = policy("fast")
+    anchor = [torch.zeros_like(parameter) for parameter in p.adapted_parameters()]
+    distance = sum(parameter.square().sum().item() for parameter in p.adapted_parameters())
+    record = td3_update(
+        p,
+        replay(),
+        STILL,
+        torch.Generator(),
+        update_actor=True,
+        anchor=anchor,
+        anchor_weight=1e6,
+        weights=torch.zeros(64),
+    )
+    assert record["anchor_distance"].item() == pytest.approx(distance, rel=1e-5)
+    assert sum(parameter.square().sum().item() for parameter in p.adapted_parameters()) < distance
+
+
+def test_without_context_the_policy_is_deaf_to_its_history() -> None:
+    batch = replay()
+    deaf, hears = policy("fast", uses_context=False), policy("fast")
+    assert not deaf.encode(batch.windows).any()
+    assert hears.encode(batch.windows).std(0).min() > 0

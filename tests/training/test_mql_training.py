@@ -1,0 +1,96 @@
+"""A meta-training as a run: it is stopped, goes on with its replay, and drives in an evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from outlap.config import load_config
+from outlap.drivers.policy import PolicyDriver
+from outlap.envs.race_config import RaceConfig
+from outlap.errors import OutlapError
+from outlap.evaluation.rollout import evaluate
+from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.mql import MQL
+from outlap.track import Track
+from outlap.training.mql import MQLConfig
+from outlap.training.run import load_run
+from outlap.training.session import Progress, train
+from synthetic_tracks import ring
+
+ENV = RaceConfig(
+    tracks=("ring5",),
+    beams=16,
+    control_interval=5,
+    speed_range=(0.0, 3.0),
+    observation=("scan", "vel", "previous_reward"),
+    scale_observations=True,
+    termination={"time_limit": 2.0},  # type: ignore[arg-type]
+)
+SMALL = MQLConfig(
+    env=ENV, total_steps=640, num_envs=8, learning_starts=64, batch_size=32, buffer_size=2000, checkpoint_every=256
+)
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A current folder of its own, from which the ring has a name; one torch thread."""
+    ring(radius=5.0).save(tmp_path / "maps" / "ring5")
+    monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
+    monkeypatch.chdir(tmp_path)
+    torch.set_num_threads(1)
+
+
+def stopped_after(steps: int, folder: Path) -> None:
+    def stop(progress: Progress) -> None:
+        if progress.steps >= steps:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(SMALL, folder, on_progress=stop)
+
+
+def test_a_stopped_run_goes_on_with_its_replay() -> None:
+    stopped_after(256, Path("run"))
+    run = load_run("run")
+    assert isinstance(run.config, MQLConfig)
+    assert load_config(MQLConfig, run.folder / "config.yaml") == SMALL
+    before = HistoryBuffer.load(run.replay_path)
+    assert before.transitions() == 256
+    train(run.config, run.folder, resume=run)
+    after = HistoryBuffer.load(run.replay_path)
+    assert after.transitions() == 640
+    for name in ("scan", "vel"):  # what was seen before the stop, and then the rest
+        np.testing.assert_array_equal(after.observation[name][: before.added], before.observation[name][: before.added])
+    model = MQL.load(run.policy_path, device="cpu")
+    assert model.num_timesteps == 640
+    assert model._n_updates == (640 - 64) // 8 - 1  # all but the one that the stop came before
+    assert set(after.tasks) == {"ring5"}
+
+
+def test_an_evaluation_does_not_depend_on_how_many_race_at_once() -> None:
+    run = train(SMALL, Path("run"))
+    rows = []
+    for worlds in (3, 6):
+        driver = PolicyDriver.load(run.policy_path, algorithm=MQL, scale_observations=True)
+        rows.append(evaluate(driver, ENV, [Track.load("ring5")], episodes=6, seed=1, num_worlds=worlds))
+    assert rows[0].equals(rows[1])
+
+
+def test_a_context_needs_the_reward_that_it_is_to_use() -> None:
+    config = SMALL.model_copy(update={"env": ENV.model_copy(update={"observation": ("scan", "vel")})})
+    run = train(config, Path("run"))  # the environment's wrapper tells it while learning
+    assert "previous_reward" in MQL.load(run.policy_path, device="cpu").policy.window_terms
+    driver = PolicyDriver.load(run.policy_path, algorithm=MQL, scale_observations=True)
+    assert "previous_reward" in driver.observation_terms  # and the evaluation asks for it by name
+
+
+def test_a_run_of_another_algorithm_is_named() -> None:
+    stopped_after(256, Path("run"))
+    path = Path("run/config.yaml")
+    path.write_text(path.read_text().replace("algorithm: mql", "algorithm: dqn"))
+    with pytest.raises(OutlapError, match=r"algorithm is 'dqn'; must be one of ppo, mql"):
+        load_run("run")
