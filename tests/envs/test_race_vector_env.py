@@ -221,12 +221,14 @@ def test_a_control_interval_is_that_many_physics_steps_of_the_same_action(varied
         actions = rng.uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
         rewards = np.zeros(3)
         for _ in range(4):
-            a, reward, terminated, _, info = fine.step(actions)
+            a, last, terminated, _, info = fine.step(actions)
             crashed |= terminated
-            rewards += reward
+            rewards += last
         b, reward, terminated, _, coarse_info = coarse.step(actions)
         if crashed.any():
             break
+        np.testing.assert_allclose(b.pop("previous_reward")[:, 0], reward, rtol=1e-6)
+        np.testing.assert_allclose(a.pop("previous_reward")[:, 0], last, rtol=1e-6)
         assert_equal(a, b, "observation")
         np.testing.assert_array_equal(fine.race.worlds.state, coarse.race.worlds.state)
         np.testing.assert_array_equal(info["time_s"], coarse_info["time_s"])

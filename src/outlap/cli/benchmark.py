@@ -1,4 +1,4 @@
-"""`outlap benchmark simulator`."""
+"""`outlap benchmark simulator` and `outlap benchmark mql`."""
 
 from __future__ import annotations
 
@@ -168,3 +168,110 @@ def _print(console: Console, rows: list[dict[str, Any]]) -> None:
         )
     console.print(table)
     console.print("compile: what the kernels' first call took; the result is cached on disk", style="dim")
+
+
+MQL_CASES = (("paper", 540, 256), ("fast", 108, 512))  # preset, beams, batch
+MQL_WORLDS = 128
+FILLED = 60  # actions of every world in the replay before anything is measured
+
+
+@dataclass(frozen=True)
+class BenchmarkMQL:
+    """Measure updates of Meta-Q-Learning, and a training as a whole.
+
+    `update_ms` is the time of one update: a batch gathered from the replay, both losses, every second time the
+    actor's. `env_steps_per_second` is the pace of a training with one update for an action of all 128 worlds.
+    """
+
+    preset: Literal["fast", "paper"] | None = None
+    """Networks; with --beams and --batch one case in place of the usual two."""
+
+    beams: int | None = None
+    """LiDAR beams."""
+
+    batch: int | None = None
+    """Transitions of an update."""
+
+    updates: int = 40
+    """Updates of a measurement."""
+
+    repeats: int = 3
+    """Measurements of each case; the median is reported, with the fastest and the slowest."""
+
+    device: str = "cpu"
+    """Of the networks."""
+
+    quiet: FlagCreatePairsOff[bool] = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        given = (self.preset, self.beams, self.batch)
+        if any(each is None for each in given) and any(each is not None for each in given):
+            raise OutlapError("--preset, --beams and --batch go together: give all for one case, or none for the usual")
+        if self.updates < 2 or self.repeats < 1:
+            raise OutlapError("--updates must be at least 2 and --repeats at least 1")
+        cases = MQL_CASES if self.preset is None else (given,)
+        rows = []
+        with progress_bar("benchmark", len(cases), "cases", self.quiet) as update:
+            for preset, beams, batch in cases:
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    rows.append(pool.apply(_measure_mql, (self, preset, beams, batch)))
+                update(len(rows), f"{preset}, {beams} beams, batch {batch}")
+        data = {"rows": rows, "device": self.device, "cores": os.cpu_count(), "machine": platform.platform()}
+        return CommandResult(data, lambda console: _print_mql(console, rows))
+
+
+def _measure_mql(settings: BenchmarkMQL, preset: str, beams: int, batch: int) -> dict[str, Any]:
+    import numpy as np
+
+    from outlap.envs.sb3_vec_env import SB3VecEnv
+    from outlap.training.mql import MQLConfig
+
+    terms = ("scan", "pose", "vel", "heading", "previous_reward")
+    env = MQLConfig().env.model_copy(update={"beams": beams, "observation": terms, "augment_tracks": False})
+    config = MQLConfig.model_validate(
+        {
+            "env": env, "preset": preset, "batch_size": batch, "device": settings.device, "num_envs": MQL_WORLDS,
+            "n_steps": 1, "learning_starts": FILLED * MQL_WORLDS, "buffer_size": 1000 * MQL_WORLDS,
+        }
+    )  # fmt: skip
+    model = config.make_model(SB3VecEnv(MQL_WORLDS, **dict(env)))
+    model.learn((FILLED + 4) * MQL_WORLDS)
+    updates, rates = [], []
+    for _ in range(settings.repeats):
+        begin = time.perf_counter()
+        model.train(settings.updates, batch)
+        updates.append(1e3 * (time.perf_counter() - begin) / settings.updates)
+        begin = time.perf_counter()
+        model.learn(settings.updates * MQL_WORLDS, reset_num_timesteps=False)
+        rates.append(settings.updates * MQL_WORLDS / (time.perf_counter() - begin))
+    return {
+        "preset": preset,
+        "beams": beams,
+        "batch": batch,
+        "update_ms": round(float(np.median(updates)), 2),
+        "fastest_update_ms": round(min(updates), 2),
+        "slowest_update_ms": round(max(updates), 2),
+        "env_steps_per_second": round(float(np.median(rates))),
+    }
+
+
+def _print_mql(console: Console, rows: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    table = Table(title="Meta-Q-Learning: updates, and trainings with one update for an action of 128 worlds")
+    for heading in ("preset", "beams", "batch", "update [ms]", "fastest … slowest", "env-steps/s"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(
+            row["preset"],
+            str(row["beams"]),
+            str(row["batch"]),
+            f"{row['update_ms']:.1f}",
+            f"{row['fastest_update_ms']:.1f} … {row['slowest_update_ms']:.1f}",
+            f"{row['env_steps_per_second']:,}",
+        )
+    console.print(table)

@@ -79,7 +79,7 @@ class Evaluate:
         from outlap.evaluation.rollout import standing_starts
 
         run, trained_env = self._subject()
-        tracks = load_tracks(self.tracks or _held_out(run))
+        tracks = load_tracks(self.tracks or held_out_tracks(run))
         env = standing_starts(_with_top_speed(trained_env, self.v_max), tracks, self.laps, self.time_limit)
         driver = self._driver(run)
         home = run.folder if run else Path("runs") / driver.name
@@ -297,7 +297,7 @@ def _drivers() -> dict[str, Any]:
     return {CenterlineFollower.name: CenterlineFollower}
 
 
-def _held_out(run: Run | None) -> tuple[str, ...]:
+def held_out_tracks(run: Run | None) -> tuple[str, ...]:
     from outlap.track.generate import BUILTIN_HELD_OUT
 
     return (run.config.held_out_tracks if run else ()) or BUILTIN_HELD_OUT

@@ -51,8 +51,10 @@ COMMANDS = (
     Entry("tracks download", "outlap.cli.tracks:DownloadTracks", "get circuits from the official archive"),
     Entry("train ppo", "outlap.cli.train:TrainPPO", "train a policy with PPO and domain randomization"),
     Entry("train mql", "outlap.cli.train:TrainMQL", "meta-train a policy with Meta-Q-Learning"),
+    Entry("adapt", "outlap.cli.adapt:Adapt", "adapt a meta-trained policy to tracks, and race it before and after"),
     Entry("evaluate", "outlap.cli.evaluate:Evaluate", "race a trained policy on tracks and measure it"),
     Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),
+    Entry("benchmark mql", "outlap.cli.benchmark:BenchmarkMQL", "measure updates of Meta-Q-Learning"),
     Entry("demo", "outlap.cli.demo:Demo", "train and evaluate on built-in circuits in a few minutes"),
 )
 

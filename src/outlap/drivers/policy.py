@@ -13,6 +13,7 @@ from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.policies import BasePolicy
 
 # Observations that a network sees at once. A matrix product rounds differently with the number of its rows;
 # this many always, padded where there are fewer, make a car's action independent of the cars beside it.
@@ -27,7 +28,7 @@ class PolicyDriver:
 
     def __init__(
         self,
-        model: BaseAlgorithm,
+        model: BaseAlgorithm | BasePolicy,
         *,
         scale_observations: bool,
         deterministic: bool = True,
@@ -37,7 +38,7 @@ class PolicyDriver:
         """Wrap a model.
 
         Args:
-            model: whose observation is a Dict of observation terms.
+            model: or a policy by itself; its observation is a Dict of observation terms.
             scale_observations: whether it was trained on terms divided by their scale.
             deterministic: take the most likely action; otherwise draw from the policy's distribution.
             seed: of those draws.
@@ -54,7 +55,7 @@ class PolicyDriver:
         self.observation_terms = tuple(space.spaces)
         self.scale_observations = scale_observations
         self._space = space
-        self._policy = model.policy
+        self._policy: Any = getattr(model, "policy", model)
         self._policy.set_training_mode(False)
         self._deterministic = deterministic
         self._random = None if deterministic else _random_state(seed)

@@ -119,7 +119,7 @@ class HistoryBuffer:
         return max(0, self.added - self.capacity)
 
     def transitions(self, task: TaskName = None) -> int:
-        """How many transitions can be drawn, of one task or of all."""
+        """How many transitions can be drawn, of one named task or, by default, of all."""
         which = self._departures if task is None else [self._departures[self._numbers[task]]]
         return sum(recent.count(self.oldest) for recent in which)
 

@@ -77,7 +77,8 @@ def td3_update(
     if update_actor:
         seen_by_actor = embedding.detach() if shared else policy.actor.encoder(seen)
         with _frozen(policy.critic.heads):
-            value = policy.critic(embedding.detach(), policy.actor(seen_by_actor, context), context.detach())[0]
+            chosen = policy.actor(seen_by_actor, context)
+            value = policy.critic(embedding.detach(), chosen, context.detach(), slice(1))[0]
         actor_loss = -(value if weights is None else weights * value).mean()
         loss = loss + actor_loss
         record["actor_loss"] = actor_loss.detach()

@@ -92,11 +92,11 @@ class TwinMLP(nn.Module):
             nn.init.uniform_(weight, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
             nn.init.uniform_(bias, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
 
-    def forward(self, x: Tensor) -> Tensor:
-        x = x.expand(2, *x.shape)
+    def forward(self, x: Tensor, which: slice = slice(2)) -> Tensor:
+        x = x.expand(len(range(2)[which]), *x.shape)
         last = len(self.weights) - 1
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = torch.baddbmm(bias, x, weight)
+            x = torch.baddbmm(bias[which], x, weight[which])
             if i < last:
                 if self.layer_norm:
                     x = functional.layer_norm(x, x.shape[-1:])
@@ -117,15 +117,15 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """What it sees, an action and the context → two estimates of the return, (2, n)."""
+    """What it sees, an action and the context → two estimates of the return, (2, n), or only some of them."""
 
     def __init__(self, encoder: ObservationEncoder, heads: TwinMLP) -> None:
         super().__init__()
         self.encoder = encoder
         self.heads = heads
 
-    def forward(self, embedding: Tensor, action: Tensor, context: Tensor) -> Tensor:
-        return self.heads(torch.cat([embedding, action, context], -1))
+    def forward(self, embedding: Tensor, action: Tensor, context: Tensor, which: slice = slice(2)) -> Tensor:
+        return self.heads(torch.cat([embedding, action, context], -1), which)
 
 
 class Preset:

@@ -76,9 +76,9 @@ class MQLPolicy(BasePolicy):
     def make_optimizers(self, learning_rate: float) -> None:
         """New optimizers; the context belongs to the critics' one, and is trained by both losses."""
         ours = self.actor.head if self.shares_encoder else self.actor
-        self.actor_optimizer = torch.optim.Adam(ours.parameters(), lr=learning_rate)
+        self.actor_optimizer = torch.optim.Adam(ours.parameters(), lr=learning_rate, fused=True)
         self.critic_optimizer = torch.optim.Adam(
-            [*self.critic.parameters(), *self.context.parameters()], lr=learning_rate
+            [*self.critic.parameters(), *self.context.parameters()], lr=learning_rate, fused=True
         )
 
     def adapted_parameters(self) -> list[torch.nn.Parameter]:

@@ -33,7 +33,7 @@ class Propensity:
 
     def beta(self, features: np.ndarray) -> np.ndarray:
         """exp(-f(x)), (n,), unclipped but for float32's sake."""
-        return np.exp(np.minimum(self.log_beta(features), LARGEST_EXPONENT))
+        return np.exp(np.clip(self.log_beta(features), -LARGEST_EXPONENT, LARGEST_EXPONENT))
 
 
 def fit_propensity(new: np.ndarray, meta: np.ndarray, regularization: float = 0.1) -> Propensity:

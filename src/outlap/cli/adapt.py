@@ -1,0 +1,202 @@
+"""`outlap adapt`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from outlap.cli.evaluate import held_out_tracks
+from outlap.cli.output import CommandResult
+from outlap.cli.progress import progress_bar
+from outlap.errors import OutlapError
+from outlap.mql.adaptation import AdaptationSettings, adapt
+from outlap.mql.propensity import CLIP_RULES
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Console
+
+Rule = Literal["abc", "fixed", "none"]
+
+
+@dataclass(frozen=True)
+class Adapt:
+    """Adapt a meta-trained policy to tracks, and race it before and after on the same episodes.
+
+    A task is a track with the run's cars, drawn anew in every episode. Every clip rule adapts from the same
+    seeds, each time starting from the meta-policy, which stays as it is.
+    """
+
+    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
+    """A run folder of `outlap train mql`."""
+
+    tracks: tuple[str, ...] = ()
+    """Names or map folders; by default the run's held-out tracks, or else the built-in held-out ones."""
+
+    clip: tuple[Rule, ...] = ("none", "fixed", "abc")
+    """How propensity weights are clipped: Adaptive Beta Clipping, the original's fixed clip, or not."""
+
+    seeds: int = 5
+    """Adaptations to each track with each clip rule."""
+
+    iterations: int = 10
+    """Of each adaptation."""
+
+    collect_steps: int = 100
+    """Actions in the new task that each of --collect-worlds makes before every iteration."""
+
+    collect_worlds: int = 8
+    """Cars that collect."""
+
+    on_task_steps: int = 5
+    """Updates on the new task alone in every iteration."""
+
+    replay_steps: int = 30
+    """Updates on the weighted replay in every iteration."""
+
+    learning_rate: float = 1e-4
+    """Of the adaptation."""
+
+    episodes: int = 100
+    """Raced on each track before, and after each adaptation."""
+
+    time_limit: float = 40.0
+    """[s] of an episode."""
+
+    seed: int = 0
+    """Of the episodes, and the first of the adaptations."""
+
+    out: Path | None = None
+    """A new or empty folder for the results; by default RUN/adaptations/TIME."""
+
+    quiet: FlagCreatePairsOff[bool] = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        import pandas as pd
+
+        from outlap.drivers.policy import PolicyDriver
+        from outlap.envs.sb3_vec_env import SB3VecEnv
+        from outlap.envs.tasks import load_tracks
+        from outlap.evaluation.results import prepare_folder, save_results
+        from outlap.evaluation.rollout import evaluate, standing_starts
+        from outlap.mql.mql import MQL
+        from outlap.training.run import load_run, provenance
+
+        for flag in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
+            if getattr(self, flag) < 1:
+                raise OutlapError(f"--{flag.replace('_', '-')} is {getattr(self, flag)}; must be 1 or more")
+        run = load_run(self.run_folder)
+        if run.config.algorithm != "mql":
+            raise OutlapError(
+                f"{self.run_folder}: was trained with {run.config.algorithm}; must be one of outlap train mql"
+            )
+        tracks = load_tracks(self.tracks or held_out_tracks(run))
+        meta = MQL.load(run.policy_path, device=run.config.device)
+        meta.load_replay_buffer(run.replay_path)
+        folder = self.out or run.folder / "adaptations" / time.strftime("%Y%m%d-%H%M%S")
+        prepare_folder(folder)
+        races = standing_starts(run.config.env, tracks, 0, self.time_limit)
+        collecting = run.config.env.model_copy(update={"augment_tracks": False})
+        base = AdaptationSettings(
+            iterations=self.iterations, collect_steps=self.collect_steps, on_task_steps=self.on_task_steps,
+            replay_steps=self.replay_steps, learning_rate=self.learning_rate,
+        )  # fmt: skip
+        rows: list[pd.DataFrame] = []
+        updates: list[pd.DataFrame] = []
+        total = len(tracks) * (1 + self.seeds * len(self.clip))
+        with progress_bar("adapting", total, "policies", self.quiet) as update:
+            for track in tracks:
+
+                def race(policy: Any, method: str, seed: int, track: Any = track) -> None:
+                    driver = PolicyDriver(policy, scale_observations=races.scale_observations, name=method)
+                    raced = evaluate(driver, races, [track], self.episodes, self.seed)
+                    rows.append(raced.assign(method=method, adaptation_seed=seed))
+                    update(len(rows), f"{method} on {track.name}: {(raced['outcome'] == 'crash').mean():.1%} crashes")
+
+                race(meta, "before", -1)
+                for seed in range(self.seed, self.seed + self.seeds):
+                    for rule in self.clip:
+                        task = SB3VecEnv(self.collect_worlds, **{**dict(collecting), "tracks": [track]})
+                        task.seed(10_000 + seed)
+                        adapted, record = adapt(meta, task, replace(base, clip=CLIP_RULES[rule]()), seed=seed)
+                        updates.append(pd.DataFrame(record.updates).assign(method=rule, seed=seed, track=track.name))
+                        race(adapted, rule, seed)
+        everything = pd.concat(rows, ignore_index=True)
+        summary = summarise_methods(everything)
+        record = {**provenance(), "settings": self, "tracks": {track.name: track.fingerprint for track in tracks}}
+        save_results(folder, everything, summary, record)
+        pd.concat(updates, ignore_index=True).to_parquet(folder / "updates.parquet", index=False)
+        data = {**summary, "folder": folder}
+        return CommandResult(data, lambda console: _print(console, data))
+
+
+def summarise_methods(rows: pd.DataFrame) -> dict[str, Any]:
+    """Crash rate, speed and progress of each method, over all tracks and by track; the adaptation seed is the unit.
+
+    Args:
+        rows: of episodes, with `method` and `adaptation_seed`.
+
+    Returns:
+        method → {"all": …, "tracks": {name: …}}, each with `crash_rate`, `mean_speed_mps` and `progress_m` as
+        {mean, sd, low, high}; `before` has one seed, and no interval.
+    """
+    import numpy as np
+
+    from outlap.evaluation.statistics import estimate_mean
+
+    columns = {name: rows[name].to_numpy() for name in ("method", "track", "adaptation_seed")}
+    values = {
+        "crash_rate": (rows["outcome"] == "crash").to_numpy(np.float64),
+        "mean_speed_mps": rows["mean_speed_mps"].to_numpy(np.float64),
+        "progress_m": rows["progress_m"].to_numpy(np.float64),
+    }
+
+    def of(chosen: np.ndarray) -> dict[str, Any]:
+        seeds = columns["adaptation_seed"]
+        each = [chosen & (seeds == seed) for seed in np.unique(seeds[chosen])]
+        means = {name: np.array([value[one].mean() for one in each]) for name, value in values.items()}
+        counts = {"episodes": int(chosen.sum()), "seeds": len(each)}
+        return {**counts, **{name: estimate_mean(mean)._asdict() for name, mean in means.items()}}
+
+    summary = {}
+    for method in dict.fromkeys(columns["method"].tolist()):
+        mine = columns["method"] == method
+        tracks = dict.fromkeys(columns["track"][mine].tolist())
+        by_track = {track: of(mine & (columns["track"] == track)) for track in tracks}
+        summary[method] = {"all": of(mine), "tracks": by_track}
+    return summary
+
+
+def _print(console: Console, data: Mapping[str, Any]) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, title="before and after adapting")
+    for heading in ("method", "track", "crash rate [%]", "speed [m/s]", "progress [m]"):
+        table.add_column(heading, justify="left" if heading in ("method", "track") else "right")
+    for method, summary in data.items():
+        if method == "folder":
+            continue
+        for track, each in [*summary["tracks"].items(), ("all", summary["all"])]:
+            crashes = _cell(each["crash_rate"], 100.0, 1)
+            speed, progress = _cell(each["mean_speed_mps"], 1.0, 2), _cell(each["progress_m"], 1.0, 0)
+            table.add_row(method, track, crashes, speed, progress, end_section=track == "all")
+    console.print(table)
+    console.print("mean over adaptation seeds [95 % interval]", style="dim")
+    console.print(f"results: {data['folder']}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _cell(value: Mapping[str, float], scale: float, digits: int) -> str:
+    mean = f"{scale * value['mean']:.{digits}f}"
+    if value["low"] != value["low"]:  # one seed has no interval
+        return mean
+    return f"{mean} [{scale * value['low']:.{digits}f}, {scale * value['high']:.{digits}f}]"

@@ -1,0 +1,100 @@
+"""`outlap train mql`, `adapt` and `benchmark mql` as a user calls them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from outlap.cli.adapt import summarise_methods
+from outlap.cli.main import main
+from synthetic_tracks import ring
+
+SMALL = [
+    "--env.tracks", "ring5", "--env.beams", "8", "--env.no-augment-tracks", "--env.termination.time-limit", "4",
+    "--num-envs", "4", "--learning-starts", "16", "--batch-size", "16", "--buffer-size", "2000", "--total-steps", "64",
+]  # fmt: skip
+SHORT = [
+    "--iterations", "1", "--collect-steps", "10", "--collect-worlds", "2", "--replay-steps", "2", "--episodes", "3",
+]  # fmt: skip
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run of a current folder from which two rings have names."""
+    for radius in (5.0, 6.0):
+        ring(radius).save(tmp_path / "maps" / f"ring{radius:.0f}")
+    monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "mql", *SMALL, "--out", "run", "--quiet"]) == 0
+    return tmp_path / "run"
+
+
+def test_train_evaluate_and_adapt(run: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "run", "--tracks", "ring6", "--episodes", "3", "--time-limit", "2", "--quiet"]) == 0
+    capfd.readouterr()
+    words = ["run", "--tracks", "ring6", "--seeds", "2", *SHORT, "--time-limit", "2", "--out", "adapted", "--quiet"]
+    assert main(["adapt", *words, "--json", "-"]) == 0
+    data = json.loads(capfd.readouterr()[0])
+    assert set(data) == {"before", "none", "fixed", "abc", "folder"}
+    assert (data["before"]["all"]["episodes"], data["abc"]["all"]["episodes"]) == (3, 6)
+    assert data["abc"]["all"]["seeds"] == 2
+    rows = pd.read_parquet("adapted/episodes.parquet")
+    assert len(rows) == 3 + 2 * 3 * 3
+    # The same episodes for all: the start says so.
+    starts = rows.groupby(["method", "adaptation_seed"])["start_m"].apply(list)
+    assert all(start == starts.iloc[0] for start in starts)
+    updates = pd.read_parquet("adapted/updates.parquet")
+    assert len(updates) == 2 * 3 * 2
+    assert {"beta_mean", "clip_level", "clipped_share", "effective_sample_size", "proximal_weight"} <= set(updates)
+
+
+def test_wrong_arguments_are_one_line(run: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    config = run / "config.yaml"
+    for words, said in (
+        (["adapt", "nowhere"], "is not a run folder"),
+        (["adapt", "run", "--seeds", "0"], "--seeds is 0; must be 1 or more"),
+        (["adapt", "run", "--clip", "tight"], "clip"),
+        (["adapt", "run", "--tracks", "nowhere"], "no track is called 'nowhere'"),
+        (["train", "ppo", "--resume", "run"], "was trained with mql, not ppo"),
+        (["benchmark", "mql", "--beams", "8"], "go together"),
+    ):
+        capfd.readouterr()
+        assert main(words) == 2
+        err = capfd.readouterr()[1]
+        assert said in err
+        assert err.count("\n") == 1
+    (run / "replay.npz").unlink()
+    assert main(["adapt", "run", "--tracks", "ring6"]) == 2
+    assert "cannot be read as a replay" in capfd.readouterr()[1]
+    assert config.exists()
+
+
+def test_the_seed_is_the_unit() -> None:
+    rows = pd.DataFrame(
+        {
+            "method": ["before"] * 2 + ["abc"] * 4,
+            "adaptation_seed": [-1, -1, 0, 0, 1, 1],
+            "track": "ring",
+            "outcome": ["crash", "timeout", "crash", "crash", "timeout", "timeout"],
+            "mean_speed_mps": [1.0, 3.0, 2.0, 2.0, 4.0, 4.0],
+            "progress_m": 1.0,
+        }
+    )
+    summary = summarise_methods(rows)
+    assert summary["before"]["all"]["crash_rate"]["mean"] == 0.5
+    abc = summary["abc"]["tracks"]["ring"]
+    assert abc["crash_rate"]["mean"] == 0.5
+    assert abc["crash_rate"]["sd"] == pytest.approx(0.5**0.5)  # of the two seeds: 1 and 0
+    assert abc["mean_speed_mps"]["mean"] == 3.0
+
+
+def test_benchmark_rows(capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["--preset", "fast", "--beams", "16", "--batch", "32", "--updates", "2", "--repeats", "1", "--json", "-"]
+    assert main(["benchmark", "mql", *words, "--quiet"]) == 0
+    (row,) = json.loads(capfd.readouterr()[0])["rows"]
+    assert (row["preset"], row["beams"], row["batch"]) == ("fast", 16, 32)
+    assert row["update_ms"] > 0
+    assert row["env_steps_per_second"] > 0
