@@ -143,7 +143,7 @@ def test_a_new_episode_forgets_the_one_before(meta: MQL) -> None:
 def test_a_saved_model_and_its_replay_go_on(meta: MQL, tmp_path: Path) -> None:
     meta.save(tmp_path / "model.zip")
     meta.save_replay_buffer(tmp_path / "replay.npz")
-    loaded = MQL.load(tmp_path / "model.zip", env=HiddenGoal(16, -1.0, 1.0), device="cpu")
+    loaded = MQL.load(tmp_path / "model.zip", env=HiddenGoal(8, -1.0, 1.0), device="cpu")  # fewer worlds than before
     loaded.load_replay_buffer(tmp_path / "replay.npz")
     assert all(torch.equal(a, b) for a, b in zip(weights(meta), weights(loaded), strict=True))
     assert mean_return(loaded, -1.0, 1.0) == mean_return(meta, -1.0, 1.0)
@@ -151,7 +151,7 @@ def test_a_saved_model_and_its_replay_go_on(meta: MQL, tmp_path: Path) -> None:
     steps, updates = loaded.num_timesteps, loaded._n_updates
     loaded.learn(320, reset_num_timesteps=False)
     assert loaded.num_timesteps == steps + 320
-    assert loaded._n_updates == updates + 80
+    assert loaded._n_updates == updates + 160
     assert torch.isfinite(torch.cat([p.flatten() for p in weights(loaded)])).all()
 
 

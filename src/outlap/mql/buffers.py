@@ -108,7 +108,7 @@ class HistoryBuffer:
         self.task = np.zeros(capacity, np.int64)
         self.added = 0  # rows so far: the next serial
         self.latest = np.full(num_worlds, NONE)  # serial of each world's newest row
-        self.task_now = np.zeros(num_worlds, np.int64)  # of each world
+        self.task_now = np.zeros(num_worlds, np.int64)  # of each world: its position in `tasks`
         self.tasks: list[TaskName] = []
         self._numbers: dict[TaskName, int] = {}
         self._departures: list[_Recent] = []  # of every task: rows that have a row after them
@@ -122,6 +122,12 @@ class HistoryBuffer:
         """How many transitions can be drawn, of one named task or, by default, of all."""
         which = self._departures if task is None else [self._departures[self._numbers[task]]]
         return sum(recent.count(self.oldest) for recent in which)
+
+    def forget_worlds(self, num_worlds: int) -> None:
+        """Keep all rows, and let so many worlds begin anew."""
+        self.num_worlds = num_worlds
+        self.latest = np.full(num_worlds, NONE)
+        self.task_now = np.zeros(num_worlds, np.int64)
 
     def begin(self, worlds: np.ndarray, observation: Mapping[str, np.ndarray], tasks: Sequence[TaskName]) -> None:
         """Add the first row of an episode in some worlds.

@@ -198,8 +198,10 @@ class MQL(OffPolicyAlgorithm):
         self.replay_buffer.save(path)
 
     def load_replay_buffer(self, path: str | os.PathLike[str], truncate_last_traj: bool = True) -> None:  # type: ignore[override]
-        """Take up a replay that `save_replay_buffer` wrote; see `HistoryBuffer.load`."""
+        """Take up a replay that `save_replay_buffer` wrote, of any number of worlds; see `HistoryBuffer.load`."""
         self.replay_buffer = HistoryBuffer.load(path)
+        self.replay_buffer.forget_worlds(self.n_envs)
+        self._last_obs = None  # so that `learn` begins new episodes
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_rng", "_noise"]
