@@ -122,7 +122,7 @@ def test_beta_stays_finite() -> None:
     assert np.isfinite(beta).all()
     assert beta[0] == beta[1] > 1e10
     assert beta[2] == pytest.approx(math.exp(2.0))
-    assert beta[3] == 0.0
+    assert 0.0 < beta[3] < 1e-10  # a batch far from the task still has an effective sample size
 
 
 def test_beta_squared_and_summed_stays_finite_in_single_precision() -> None:
