@@ -132,6 +132,15 @@ def load_config(cls: type[ConfigT], path: str | os.PathLike[str]) -> ConfigT:
     Raises:
         OutlapError: one line with the file, the dotted field, the value and what would be right.
     """
+    return validate(cls, read_yaml(path), str(Path(path)))
+
+
+def read_yaml(path: str | os.PathLike[str]) -> Any:
+    """What a YAML file holds, nothing being an empty mapping; loaded safely.
+
+    Raises:
+        OutlapError: one line with the file and what is wrong with it.
+    """
     path = Path(path)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -145,7 +154,7 @@ def load_config(cls: type[ConfigT], path: str | os.PathLike[str]) -> ConfigT:
         raise OutlapError(f"{path}: is nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: what a date such as 2026-99-99 raises
         raise OutlapError(f"{path}: is not valid YAML: {_yaml_problem(error)}") from None
-    return validate(cls, {} if content is None else content, str(path))
+    return {} if content is None else content
 
 
 def save_config(config: BaseModel, path: str | os.PathLike[str]) -> Path:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from outlap.cli.adapt import summarise_methods
 from outlap.cli.main import main
+from outlap.evaluation.metrics import summarise_methods
 from synthetic_tracks import ring
 
 SMALL = [

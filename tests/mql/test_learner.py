@@ -11,7 +11,7 @@ import torch
 
 from outlap.mql.buffers import HistoryBuffer
 from outlap.mql.learner import TD3Settings, td3_update
-from outlap.mql.policies import MQLPolicy, _tensor
+from outlap.mql.policies import MQLPolicy, to_tensor
 
 SPACE = gym.spaces.Dict(
     {
@@ -71,13 +71,13 @@ def plain_losses(p: MQLPolicy, batch, n_steps: int):
     here = torch.arange(5)[None].expand(len(batch.action), 5)
     there = here + torch.as_tensor(batch.steps)[:, None]
     names = p.critic.encoder.encoders
-    now = {name: _tensor(batch.observation[name], p.device) for name in names}
-    then = {name: _tensor(batch.next_observation[name], p.device) for name in names}
+    now = {name: to_tensor(batch.observation[name], p.device) for name in names}
+    then = {name: to_tensor(batch.next_observation[name], p.device) for name in names}
     actor_encoder = p.critic_target.encoder if p.shares_encoder else p.actor_target.encoder
     action = p.actor_target(actor_encoder(then), z(there).detach())
     q = p.critic_target(p.critic_target.encoder(then), action, z(there).detach()).min(0).values
-    target = (_tensor(batch.reward, p.device) + _tensor(batch.discount, p.device) * q).detach()
-    values = p.critic(p.critic.encoder(now), _tensor(batch.action, p.device), z(here))
+    target = (to_tensor(batch.reward, p.device) + to_tensor(batch.discount, p.device) * q).detach()
+    values = p.critic(p.critic.encoder(now), to_tensor(batch.action, p.device), z(here))
     each = ((values - target) ** 2).sum(0)
     mine = p.critic.encoder(now).detach() if p.shares_encoder else p.actor.encoder(now)
     chosen = p.actor(mine, z(here))

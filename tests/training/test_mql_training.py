@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from outlap.config import load_config
 from outlap.drivers.policy import PolicyDriver
@@ -18,8 +17,8 @@ from outlap.mql.mql import MQL
 from outlap.track import Track
 from outlap.training.mql import MQLConfig
 from outlap.training.run import load_run
-from outlap.training.session import Progress, train
-from synthetic_tracks import ring
+from outlap.training.session import train
+from stopped_training import stopped_after
 
 ENV = RaceConfig(
     tracks=("ring5",),
@@ -35,26 +34,8 @@ SMALL = MQLConfig(
 )
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A current folder of its own, from which the ring has a name; one torch thread."""
-    ring(radius=5.0).save(tmp_path / "maps" / "ring5")
-    monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
-    monkeypatch.chdir(tmp_path)
-    torch.set_num_threads(1)
-
-
-def stopped_after(steps: int, folder: Path) -> None:
-    def stop(progress: Progress) -> None:
-        if progress.steps >= steps:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(SMALL, folder, on_progress=stop)
-
-
 def test_a_stopped_run_goes_on_with_its_replay() -> None:
-    stopped_after(256, Path("run"))
+    stopped_after(256, SMALL, Path("run"))
     run = load_run("run")
     assert isinstance(run.config, MQLConfig)
     assert load_config(MQLConfig, run.folder / "config.yaml") == SMALL
@@ -89,7 +70,7 @@ def test_a_context_needs_the_reward_that_it_is_to_use() -> None:
 
 
 def test_a_run_of_another_algorithm_is_named() -> None:
-    stopped_after(256, Path("run"))
+    stopped_after(256, SMALL, Path("run"))
     path = Path("run/config.yaml")
     path.write_text(path.read_text().replace("algorithm: mql", "algorithm: dqn"))
     with pytest.raises(OutlapError, match=r"algorithm is 'dqn'; must be one of ppo, mql"):

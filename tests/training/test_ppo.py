@@ -17,7 +17,7 @@ from outlap.errors import OutlapError
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
 from outlap.training.session import Progress, train
-from synthetic_tracks import ring
+from stopped_training import stopped_after
 
 ENV = RaceConfig(
     tracks=("ring5",),
@@ -31,15 +31,6 @@ ENV = RaceConfig(
 SMALL = PPOConfig(
     env=ENV, total_steps=512, num_envs=8, n_steps=16, batch_size=64, n_epochs=2, net_arch=(16,), checkpoint_every=128
 )
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A current folder of its own, from which the ring has a name; one torch thread."""
-    ring(radius=5.0).save(tmp_path / "maps" / "ring5")
-    monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
-    monkeypatch.chdir(tmp_path)
-    torch.set_num_threads(1)
 
 
 def weights(path: Path) -> np.ndarray:
@@ -69,19 +60,8 @@ def test_the_same_seed_gives_the_same_policy_and_another_one_does_not() -> None:
     assert not np.array_equal(weights(first.policy_path), weights(third.policy_path))
 
 
-def stopped_after(steps: int, folder: Path) -> None:
-    """A training that Ctrl-C ends."""
-
-    def stop(progress: Progress) -> None:
-        if progress.steps >= steps:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(SMALL, folder, on_progress=stop)
-
-
 def test_a_stopped_run_goes_on_where_it_was() -> None:
-    stopped_after(256, Path("run"))
+    stopped_after(256, SMALL, Path("run"))
     run = load_run("run")
     assert run.policy_path.name == "step_000000256.zip"
     run.write_record(seconds=1000.0)
@@ -98,7 +78,7 @@ def test_a_stopped_run_goes_on_where_it_was() -> None:
 
 
 def test_a_broken_checkpoint_gives_way_to_the_one_before() -> None:
-    stopped_after(384, Path("run"))
+    stopped_after(384, SMALL, Path("run"))
     run = load_run("run")
     newest = run.checkpoints()[0]
     newest.write_bytes(newest.read_bytes()[:1000])
@@ -116,7 +96,7 @@ def test_a_finished_run_is_not_trained_further() -> None:
 
 
 def test_curricula_go_on_from_where_the_run_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    stopped_after(256, Path("run"))
+    stopped_after(256, SMALL, Path("run"))
     seen: list[int] = []
     run = load_run("run")
     from outlap.envs.race_vector_env import RaceVectorEnv

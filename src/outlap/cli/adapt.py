@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from outlap.cli.evaluate import held_out_tracks
+from outlap.cli.arguments import check_least
+from outlap.cli.evaluate import held_out_tracks, unused
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
-from outlap.mql.adaptation import AdaptationSettings, adapt
-from outlap.mql.propensity import CLIP_RULES
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Console
+
+    from outlap.track import Track
 
 Rule = Literal["abc", "fixed", "none"]
 
@@ -86,14 +87,17 @@ class Adapt:
         from outlap.drivers.policy import PolicyDriver
         from outlap.envs.sb3_vec_env import SB3VecEnv
         from outlap.envs.tasks import load_tracks
+        from outlap.envs.terminations import CRASH
+        from outlap.evaluation.metrics import summarise_methods
         from outlap.evaluation.results import prepare_folder, save_results
         from outlap.evaluation.rollout import evaluate, standing_starts
+        from outlap.mql.adaptation import AdaptationSettings, adapt
         from outlap.mql.mql import MQL
+        from outlap.mql.propensity import CLIP_RULES
         from outlap.training.run import load_run, provenance
 
-        for flag in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
-            if getattr(self, flag) < 1:
-                raise OutlapError(f"--{flag.replace('_', '-')} is {getattr(self, flag)}; must be 1 or more")
+        for name in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
+            check_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)
         run = load_run(self.run_folder)
         if run.config.algorithm != "mql":
             raise OutlapError(
@@ -102,7 +106,7 @@ class Adapt:
         tracks = load_tracks(self.tracks or held_out_tracks(run))
         meta = MQL.load(run.policy_path, device=run.config.device)
         meta.load_replay_buffer(run.replay_path)
-        folder = self.out or run.folder / "adaptations" / time.strftime("%Y%m%d-%H%M%S")
+        folder = self.out or unused(run.folder / "adaptations" / time.strftime("%Y%m%d-%H%M%S"))
         prepare_folder(folder)
         races = standing_starts(run.config.env, tracks, 0, self.time_limit)
         collecting = run.config.env.model_copy(update={"augment_tracks": False})
@@ -114,22 +118,22 @@ class Adapt:
         updates: list[pd.DataFrame] = []
         total = len(tracks) * (1 + self.seeds * len(self.clip))
         with progress_bar("adapting", total, "policies", self.quiet) as update:
+
+            def race(policy: Any, track: Track, method: str, seed: int) -> None:
+                driver = PolicyDriver(policy, scale_observations=races.scale_observations, name=method)
+                raced = evaluate(driver, races, [track], self.episodes, self.seed)
+                rows.append(raced.assign(method=method, adaptation_seed=seed))
+                update(len(rows), f"{method} on {track.name}: {(raced['outcome'] == CRASH).mean():.1%} crashes")
+
             for track in tracks:
-
-                def race(policy: Any, method: str, seed: int, track: Any = track) -> None:
-                    driver = PolicyDriver(policy, scale_observations=races.scale_observations, name=method)
-                    raced = evaluate(driver, races, [track], self.episodes, self.seed)
-                    rows.append(raced.assign(method=method, adaptation_seed=seed))
-                    update(len(rows), f"{method} on {track.name}: {(raced['outcome'] == 'crash').mean():.1%} crashes")
-
-                race(meta, "before", -1)
+                race(meta, track, "before", -1)
                 for seed in range(self.seed, self.seed + self.seeds):
                     for rule in self.clip:
                         task = SB3VecEnv(self.collect_worlds, **{**dict(collecting), "tracks": [track]})
                         task.seed(10_000 + seed)
                         adapted, record = adapt(meta, task, replace(base, clip=CLIP_RULES[rule]()), seed=seed)
                         updates.append(pd.DataFrame(record.updates).assign(method=rule, seed=seed, track=track.name))
-                        race(adapted, rule, seed)
+                        race(adapted, track, rule, seed)
         everything = pd.concat(rows, ignore_index=True)
         summary = summarise_methods(everything)
         record = {**provenance(), "settings": self, "tracks": {track.name: track.fingerprint for track in tracks}}
@@ -137,43 +141,6 @@ class Adapt:
         pd.concat(updates, ignore_index=True).to_parquet(folder / "updates.parquet", index=False)
         data = {**summary, "folder": folder}
         return CommandResult(data, lambda console: _print(console, data))
-
-
-def summarise_methods(rows: pd.DataFrame) -> dict[str, Any]:
-    """Crash rate, speed and progress of each method, over all tracks and by track; the adaptation seed is the unit.
-
-    Args:
-        rows: of episodes, with `method` and `adaptation_seed`.
-
-    Returns:
-        method → {"all": …, "tracks": {name: …}}, each with `crash_rate`, `mean_speed_mps` and `progress_m` as
-        {mean, sd, low, high}; `before` has one seed, and no interval.
-    """
-    import numpy as np
-
-    from outlap.evaluation.statistics import estimate_mean
-
-    columns = {name: rows[name].to_numpy() for name in ("method", "track", "adaptation_seed")}
-    values = {
-        "crash_rate": (rows["outcome"] == "crash").to_numpy(np.float64),
-        "mean_speed_mps": rows["mean_speed_mps"].to_numpy(np.float64),
-        "progress_m": rows["progress_m"].to_numpy(np.float64),
-    }
-
-    def of(chosen: np.ndarray) -> dict[str, Any]:
-        seeds = columns["adaptation_seed"]
-        each = [chosen & (seeds == seed) for seed in np.unique(seeds[chosen])]
-        means = {name: np.array([value[one].mean() for one in each]) for name, value in values.items()}
-        counts = {"episodes": int(chosen.sum()), "seeds": len(each)}
-        return {**counts, **{name: estimate_mean(mean)._asdict() for name, mean in means.items()}}
-
-    summary = {}
-    for method in dict.fromkeys(columns["method"].tolist()):
-        mine = columns["method"] == method
-        tracks = dict.fromkeys(columns["track"][mine].tolist())
-        by_track = {track: of(mine & (columns["track"] == track)) for track in tracks}
-        summary[method] = {"all": of(mine), "tracks": by_track}
-    return summary
 
 
 def _print(console: Console, data: Mapping[str, Any]) -> None:
@@ -197,6 +164,6 @@ def _print(console: Console, data: Mapping[str, Any]) -> None:
 
 def _cell(value: Mapping[str, float], scale: float, digits: int) -> str:
     mean = f"{scale * value['mean']:.{digits}f}"
-    if value["low"] != value["low"]:  # one seed has no interval
+    if value["low"] is None:  # one seed has no interval
         return mean
     return f"{mean} [{scale * value['low']:.{digits}f}, {scale * value['high']:.{digits}f}]"

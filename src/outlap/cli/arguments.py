@@ -47,6 +47,12 @@ def parse(command: type[CommandT], arguments: Sequence[str], prog: str) -> Comma
     raise OutlapError(message)
 
 
+def check_least(flag: str, value: int, least: int) -> None:
+    """Raises OutlapError for a flag whose value is too small."""
+    if value < least:
+        raise OutlapError(f"{flag} is {value}; must be {least} or more")
+
+
 def _config_file(arguments: Sequence[str]) -> str | None:
     path = None
     for number, word in enumerate(arguments):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.config import bounds
 from outlap.errors import OutlapError
@@ -83,7 +84,7 @@ class Evaluate:
         env = standing_starts(_with_top_speed(trained_env, self.v_max), tracks, self.laps, self.time_limit)
         driver = self._driver(run)
         home = run.folder if run else Path("runs") / driver.name
-        folder = self.out or _unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
+        folder = self.out or unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
         return evaluate_into(
             folder,
             driver,
@@ -104,8 +105,7 @@ class Evaluate:
             ("--seed", self.seed, 0),
             ("--worlds", self.worlds, 1),
         ):
-            if value < least:
-                raise OutlapError(f"{flag} is {value}; must be {least} or more")
+            check_least(flag, value, least)
         for flag, number in (("--time-limit", self.time_limit), ("--v-max", self.v_max)):
             if number is not None and not 0.0 < number < float("inf"):
                 raise OutlapError(f"{flag} is {number}; must be > 0")
@@ -298,6 +298,7 @@ def _drivers() -> dict[str, Any]:
 
 
 def held_out_tracks(run: Run | None) -> tuple[str, ...]:
+    """Names of the tracks that a run has kept from its training, or else the built-in ones."""
     from outlap.track.generate import BUILTIN_HELD_OUT
 
     return (run.config.held_out_tracks if run else ()) or BUILTIN_HELD_OUT
@@ -336,7 +337,7 @@ def _policy_record(run: Run | None) -> dict[str, Any]:
     }
 
 
-def _unused(folder: Path) -> Path:
+def unused(folder: Path) -> Path:
     """This folder, or one numbered like it where two evaluations begin in the same second."""
     numbered = (folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))
     return next(path for path in (folder, *numbered) if not path.exists())

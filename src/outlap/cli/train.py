@@ -6,7 +6,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 from tyro.conf import FlagCreatePairsOff, arg
 
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Train:
-    """What the trainings of all algorithms have in common; each adds its `settings`."""
+    """What the trainings of all algorithms have in common; each says what its `settings` are."""
+
+    config_class: ClassVar[type[TrainingConfig]]
+    settings: TrainingConfig
 
     config: Path | None = None
     """YAML file with values in place of the defaults; flags override it."""
@@ -42,9 +45,13 @@ class _Train:
     json: str | None = None
     """Write the result as JSON to this file; - for standard output."""
 
-    def train(self, settings: TrainingConfig) -> CommandResult:
-        """Train as `settings` say, or go on with what is to be resumed."""
-        name = settings.algorithm
+    @classmethod
+    def from_config(cls, path: Path) -> Self:
+        """The defaults of `--config`."""
+        return cls(settings=load_config(cls.config_class, path))
+
+    def run(self) -> CommandResult:
+        settings, name = self.settings, self.settings.algorithm
         if self.resume and (self.out or self.config or settings != type(settings).model_validate({})):
             raise OutlapError("--resume goes on with the run's own configuration and folder; leave the other flags out")
         resumed = load_run(self.resume) if self.resume else None
@@ -64,15 +71,8 @@ class TrainPPO(_Train):
     --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
     """
 
+    config_class = PPOConfig
     settings: Annotated[PPOConfig, arg(name="")] = field(default_factory=PPOConfig)
-
-    @classmethod
-    def from_config(cls, path: Path) -> TrainPPO:
-        """The defaults of `--config`."""
-        return cls(settings=load_config(PPOConfig, path))
-
-    def run(self) -> CommandResult:
-        return self.train(self.settings)
 
 
 @dataclass(frozen=True)
@@ -83,15 +83,8 @@ class TrainMQL(_Train):
     --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
     """
 
+    config_class = MQLConfig
     settings: Annotated[MQLConfig, arg(name="")] = field(default_factory=MQLConfig)
-
-    @classmethod
-    def from_config(cls, path: Path) -> TrainMQL:
-        """The defaults of `--config`."""
-        return cls(settings=load_config(MQLConfig, path))
-
-    def run(self) -> CommandResult:
-        return self.train(self.settings)
 
 
 def train_with_progress(config: TrainingConfig, folder: Path, resumed: Run | None, quiet: bool) -> Run:

@@ -39,6 +39,39 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
     return {"all": _summary(rows), "tracks": {str(name): _summary(group) for name, group in tracks}}
 
 
+def summarise_methods(rows: pd.DataFrame) -> dict[str, Any]:
+    """Crash rate, speed and progress of each method, over all tracks and by track; the adaptation seed is the unit.
+
+    Args:
+        rows: of episodes, with `method` and `adaptation_seed`.
+
+    Returns:
+        method → {"all": …, "tracks": {name: …}}, each with `crash_rate`, `mean_speed_mps` and `progress_m` as
+        {mean, sd, low, high}; `before` has one seed, and no interval.
+    """
+    columns = {name: rows[name].to_numpy() for name in ("method", "track", "adaptation_seed")}
+    values = {
+        "crash_rate": (rows["outcome"] == CRASH).to_numpy(np.float64),
+        "mean_speed_mps": rows["mean_speed_mps"].to_numpy(np.float64),
+        "progress_m": rows["progress_m"].to_numpy(np.float64),
+    }
+
+    def of(chosen: np.ndarray) -> dict[str, Any]:
+        seeds = columns["adaptation_seed"]
+        each = [chosen & (seeds == seed) for seed in np.unique(seeds[chosen])]
+        means = {name: np.array([value[one].mean() for one in each]) for name, value in values.items()}
+        counts = {"episodes": int(chosen.sum()), "seeds": len(each)}
+        return {**counts, **{name: _mean(mean) for name, mean in means.items()}}
+
+    summary = {}
+    for method in dict.fromkeys(columns["method"].tolist()):
+        mine = columns["method"] == method
+        tracks = dict.fromkeys(columns["track"][mine].tolist())
+        by_track = {track: of(mine & (columns["track"] == track)) for track in tracks}
+        summary[method] = {"all": of(mine), "tracks": by_track}
+    return summary
+
+
 def _summary(rows: pd.DataFrame) -> dict[str, Any]:
     episodes = len(rows)
     ended = rows["outcome"].to_numpy()

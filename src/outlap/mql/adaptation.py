@@ -77,7 +77,6 @@ def adapt(
     noise = torch.Generator(meta.device).manual_seed(seed)
     policy = copy.deepcopy(meta.policy)
     policy.make_optimizers(settings.learning_rate)
-    encoder = meta.policy  # features are those of the meta-policy throughout, so that β means one thing
     anchor = [parameter.detach().clone() for parameter in policy.adapted_parameters()]
     collector = None if isinstance(task, HistoryBuffer) else _Collector(meta, task, settings, rng)
     new = task if isinstance(task, HistoryBuffer) else collector.buffer  # type: ignore[union-attr]
@@ -95,13 +94,14 @@ def adapt(
     for iteration in range(settings.iterations):
         if collector is not None:
             collector.collect(policy)
-        propensity = _fit(meta, encoder, new, settings, rng)
+        propensity = _fit(meta, new, settings, rng)
         for _ in range(settings.on_task_steps):
-            on_task = update(_gather(meta, policy, new, settings.batch_size, rng))
+            on_task = update(meta.draw(new, settings.batch_size, rng))
         first = len(record.updates)
         for _ in range(settings.replay_steps):
-            batch = _gather(meta, policy, meta.replay_buffer, settings.batch_size, rng)
-            raw = propensity.beta(features(encoder, batch))
+            batch = meta.draw(meta.replay_buffer, settings.batch_size, rng)
+            # Features are the meta-policy's throughout, so that β means one thing.
+            raw = propensity.beta(features(meta.policy, batch))
             beta, level = clip.clip(raw)
             ess = effective_sample_size(beta)
             pull = settings.proximal * (1.0 - ess)
@@ -152,23 +152,14 @@ def features(policy: MQLPolicy, batch: Batch) -> np.ndarray:
         return policy.encode(batch.windows.first(policy.history)).cpu().numpy()
 
 
-def _fit(
-    meta: MQL, encoder: MQLPolicy, new: HistoryBuffer, settings: AdaptationSettings, rng: np.random.Generator
-) -> Propensity:
+def _fit(meta: MQL, new: HistoryBuffer, settings: AdaptationSettings, rng: np.random.Generator) -> Propensity:
     sides = []
     for buffer in (new, meta.replay_buffer):
         size = min(settings.classifier_size, buffer.transitions())
         if not size:
             raise OutlapError("adapt: there is no transition of the new task; collect some")
-        sides.append(features(encoder, _gather(meta, encoder, buffer, size, rng)))
+        sides.append(features(meta.policy, meta.draw(buffer, size, rng)))
     return fit_propensity(sides[0], sides[1], settings.regularization)
-
-
-def _gather(meta: MQL, policy: MQLPolicy, buffer: HistoryBuffer, size: int, rng: np.random.Generator) -> Batch:
-    return buffer.gather(
-        buffer.sample(size, rng), history=policy.history, n_steps=meta.n_steps, gamma=meta.gamma,
-        terms=policy.window_terms,
-    )  # fmt: skip
 
 
 def _numbers(record: dict[str, torch.Tensor]) -> dict[str, float]:
@@ -189,9 +180,6 @@ class _Collector:
 
     def collect(self, policy: MQLPolicy) -> None:
         for _ in range(self.settings.collect_steps):
-            windows = self.buffer.windows(self.buffer.latest, policy.history, policy.window_terms)
-            action = policy.act(self.observation, windows)
-            action = action + self.settings.exploration_noise * self.rng.standard_normal(action.shape)
-            action = np.clip(action, -1.0, 1.0).astype(np.float32)
+            action = policy.explore(self.observation, self.buffer, self.settings.exploration_noise, self.rng)
             self.observation, reward, dones, infos = self.env.step(policy.unscale_action(action))
             self.buffer.add_step(self.env, self.observation, action, reward, dones, infos)

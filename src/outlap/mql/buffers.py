@@ -21,6 +21,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.errors import OutlapError
+from outlap.files import replacing
 
 NONE = -1  # serial of no row
 
@@ -94,7 +95,6 @@ class HistoryBuffer:
                 f"replay: capacity is {capacity}; {num_worlds} worlds need at least {3 * num_worlds} rows"
             )
         self.capacity = capacity
-        self.num_worlds = num_worlds
         self.task_capacity = task_capacity or capacity
         self.observation = {
             name: np.zeros((capacity, *box.shape), np.float16 if name in half_precision else np.float32)  # type: ignore[misc]
@@ -107,11 +107,15 @@ class HistoryBuffer:
         self.after = np.full(capacity, NONE)
         self.task = np.zeros(capacity, np.int64)
         self.added = 0  # rows so far: the next serial
-        self.latest = np.full(num_worlds, NONE)  # serial of each world's newest row
-        self.task_now = np.zeros(num_worlds, np.int64)  # of each world: its position in `tasks`
+        self.forget_worlds(num_worlds)
         self.tasks: list[TaskName] = []
         self._numbers: dict[TaskName, int] = {}
         self._departures: list[_Recent] = []  # of every task: rows that have a row after them
+
+    @property
+    def num_worlds(self) -> int:
+        """Worlds that add rows."""
+        return len(self.latest)
 
     @property
     def oldest(self) -> int:
@@ -125,9 +129,8 @@ class HistoryBuffer:
 
     def forget_worlds(self, num_worlds: int) -> None:
         """Keep all rows, and let so many worlds begin anew."""
-        self.num_worlds = num_worlds
-        self.latest = np.full(num_worlds, NONE)
-        self.task_now = np.zeros(num_worlds, np.int64)
+        self.latest = np.full(num_worlds, NONE)  # serial of each world's newest row
+        self.task_now = np.zeros(num_worlds, np.int64)  # of each world: its position in `tasks`
 
     def begin(self, worlds: np.ndarray, observation: Mapping[str, np.ndarray], tasks: Sequence[TaskName]) -> None:
         """Add the first row of an episode in some worlds.
@@ -337,16 +340,9 @@ class HistoryBuffer:
         for number, recent in enumerate(self._departures):
             arrays[f"departures/{number}"] = recent.ring[: min(recent.added, len(recent.ring))]
         arrays["facts"] = np.frombuffer(json.dumps(facts).encode(), np.uint8)
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
-            with partial.open("wb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
-        return path
+        with replacing(path) as partial, partial.open("wb") as file:
+            np.savez(file, **arrays)  # type: ignore[arg-type]
+        return Path(path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> HistoryBuffer:
@@ -359,7 +355,6 @@ class HistoryBuffer:
             buffer.capacity, buffer.task_capacity = int(facts["capacity"]), int(facts["task_capacity"])
             buffer.added = int(facts["added"])
             buffer.latest, buffer.task_now = arrays["latest"], arrays["task_now"]
-            buffer.num_worlds = len(buffer.latest)
             buffer.tasks = facts["tasks"]
             buffer._numbers = {task: number for number, task in enumerate(buffer.tasks)}
             buffer.observation = {

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from outlap.mql.buffers import Batch
-from outlap.mql.policies import MQLPolicy, _tensor
+from outlap.mql.policies import MQLPolicy, to_tensor
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ def td3_update(
         distance ‖θ - anchor‖².
     """
     device = policy.device
-    action, reward, discount = (_tensor(x, device) for x in (batch.action, batch.reward, batch.discount))
-    seen = {name: _tensor(batch.observation[name], device) for name in policy.critic.encoder.encoders}
-    seen_next = {name: _tensor(batch.next_observation[name], device) for name in policy.critic.encoder.encoders}
+    action, reward, discount = (to_tensor(x, device) for x in (batch.action, batch.reward, batch.discount))
+    seen = {name: to_tensor(batch.observation[name], device) for name in policy.critic.encoder.encoders}
+    seen_next = {name: to_tensor(batch.next_observation[name], device) for name in policy.critic.encoder.encoders}
     context, context_next = _contexts(policy, batch)
 
     with torch.no_grad():

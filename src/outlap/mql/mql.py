@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.errors import OutlapError
-from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.buffers import Batch, HistoryBuffer
 from outlap.mql.context_vec_env import ContextVecEnv
 from outlap.mql.learner import TD3Settings, td3_update
 from outlap.mql.policies import MQLPolicy
@@ -147,16 +147,12 @@ class MQL(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        size = (n_envs, self.action_space.shape[0])  # type: ignore[index]
         if self.num_timesteps < learning_starts:
-            scaled = self._rng.uniform(-1.0, 1.0, size)
+            size = (n_envs, self.action_space.shape[0])  # type: ignore[index]
+            scaled = self._rng.uniform(-1.0, 1.0, size).astype(np.float32)
         else:
             assert isinstance(self._last_obs, dict)
-            history = self.replay_buffer
-            windows = history.windows(history.latest, self.policy.history, self.policy.window_terms)
-            scaled = self.policy.act(self._last_obs, windows)
-            scaled = np.clip(scaled + self.exploration_noise * self._rng.standard_normal(size), -1.0, 1.0)
-        scaled = scaled.astype(np.float32)
+            scaled = self.policy.explore(self._last_obs, self.replay_buffer, self.exploration_noise, self._rng)
         return self.policy.unscale_action(scaled), scaled
 
     def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
@@ -164,6 +160,13 @@ class MQL(OffPolicyAlgorithm):
         assert isinstance(new_obs, dict)
         self.replay_buffer.add_step(self.env, new_obs, buffer_action, reward, dones, infos)
         self._last_obs = new_obs
+
+    def draw(self, buffer: HistoryBuffer, size: int, rng: np.random.Generator, *, by_task: bool = False) -> Batch:
+        """Transitions of a buffer as this model learns from them: its history, n-step returns and discount."""
+        return buffer.gather(
+            buffer.sample(size, rng, by_task=by_task), history=self.policy.history, n_steps=self.n_steps,
+            gamma=self.gamma, terms=self.policy.window_terms,
+        )  # fmt: skip
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Make so many updates from the replay."""
@@ -177,10 +180,7 @@ class MQL(OffPolicyAlgorithm):
         settings = self.settings
         for _ in range(gradient_steps):
             self._n_updates += 1
-            batch = self.replay_buffer.gather(
-                self.replay_buffer.sample(batch_size, self._rng, by_task=self.by_task),
-                history=policy.history, n_steps=self.n_steps, gamma=self.gamma, terms=policy.window_terms,
-            )  # fmt: skip
+            batch = self.draw(self.replay_buffer, batch_size, self._rng, by_task=self.by_task)
             update_actor = self._n_updates % self.policy_delay == 0
             for name, value in td3_update(policy, batch, settings, self._noise, update_actor=update_actor).items():
                 records[name].append(value)

@@ -92,13 +92,13 @@ class MQLPolicy(BasePolicy):
     def steps(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """What the context encoder reads: (n, length, inputs), and which steps there were, (n, length)."""
         device = self.device
-        terms = {name: _tensor(windows.observation[name], device) for name in self.window_terms}
-        read = [_tensor(windows.action, device)]
+        terms = {name: to_tensor(windows.observation[name], device) for name in self.window_terms}
+        read = [to_tensor(windows.action, device)]
         if self.uses_reward:
             read.append(terms[PREVIOUS_REWARD])
         embed = self.critic.encoder.encoders if self.shares_encoder else None
         read += [embed[name](terms[name]) if embed is not None else terms[name] for name in self.context_terms]
-        return torch.cat(read, -1), _tensor(windows.valid, device)
+        return torch.cat(read, -1), to_tensor(windows.valid, device)
 
     def encode(self, windows: Windows) -> Tensor:
         """The context z (n, hidden) at the end of each window."""
@@ -110,8 +110,22 @@ class MQLPolicy(BasePolicy):
     def act(self, observation: Mapping[str, np.ndarray], windows: Windows) -> np.ndarray:
         """Actions in [-1, 1], (n, actions), without noise."""
         with torch.no_grad():
-            seen = {name: _tensor(observation[name], self.device) for name in self.actor.encoder.encoders}
+            seen = {name: to_tensor(observation[name], self.device) for name in self.actor.encoder.encoders}
             return self.actor(self.actor.encoder(seen), self.encode(windows)).cpu().numpy()
+
+    def explore(
+        self, observation: Mapping[str, np.ndarray], history: HistoryBuffer, noise: float, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Actions in [-1, 1] with Gaussian noise of a standard deviation, float32 (n, actions).
+
+        Args:
+            observation: (n, size) of each term, of all worlds of `history`.
+            history: whose newest rows they are.
+            noise: standard deviation.
+            rng: draws the noise.
+        """
+        chosen = self.act(observation, history.windows(history.latest, self.history, self.window_terms))
+        return np.clip(chosen + noise * rng.standard_normal(chosen.shape), -1.0, 1.0).astype(np.float32)
 
     def predict(  # type: ignore[override]
         self,
@@ -169,5 +183,6 @@ class MQLPolicy(BasePolicy):
         return data
 
 
-def _tensor(values: np.ndarray, device: torch.device) -> Tensor:
+def to_tensor(values: np.ndarray, device: torch.device) -> Tensor:
+    """As float32 on a device."""
     return torch.as_tensor(values).to(device, torch.float32)

@@ -78,7 +78,7 @@ def _aim(lane, first, clear, x0, y0, cos, sin, beam_cos, beam_sin, t, dx, dy, in
         return
     for k in range(LANES):
         t[lane + k] = clear
-        n = _u8(first + k)
+        n = _u8(first + k)  # unsigned: one with a sign is tested for wrapping, and then read by gathering
         a = cos * beam_cos[n] - sin * beam_sin[n]
         b = sin * beam_cos[n] + cos * beam_sin[n]
         a = STEEPEST if abs(a) < STEEPEST else a

@@ -23,7 +23,6 @@ class MQLConfig(TrainingConfig):
         update={"observation": ("scan", "vel", "heading", "previous_action", "previous_reward")}
     )
     total_steps: int = Field(default=1_500_000, gt=0)  # actions, all worlds together
-    learning_rate: float = Field(default=5e-4, gt=0)
     preset: Literal["fast", "paper"] = "fast"  # networks, see mql.networks
     history: int = Field(default=10, ge=1)  # steps that the context is made of
     uses_reward: bool = True  # whether the context is told the rewards, which a car does not have
@@ -33,7 +32,6 @@ class MQLConfig(TrainingConfig):
     batch_size: int = Field(default=512, ge=2)
     updates_per_step: int = Field(default=1, ge=1)  # for every action of all worlds
     n_steps: int = Field(default=3, ge=1)  # of a return
-    gamma: float = Field(default=0.99, gt=0, le=1)
     tau: float = Field(default=0.005, gt=0, le=1)
     exploration_noise: float = Field(default=0.15, ge=0)
     policy_noise: float = Field(default=0.2, ge=0)

@@ -36,7 +36,6 @@ class PPOConfig(TrainingConfig):
     n_steps: int = Field(default=64, ge=2)  # actions per world and rollout
     batch_size: int = Field(default=2048, ge=2)
     n_epochs: int = Field(default=5, ge=1)
-    gamma: float = Field(default=0.99, gt=0, le=1)
     gae_lambda: float = Field(default=0.95, ge=0, le=1)
     clip_range: float = Field(default=0.2, gt=0)
     ent_coef: float = Field(default=0.0, ge=0)

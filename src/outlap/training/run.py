@@ -23,11 +23,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
-from outlap.config import load_config, save_config
+from outlap.config import read_yaml, save_config, validate
 from outlap.errors import OutlapError
-from outlap.files import atomic_write, to_json
+from outlap.files import atomic_write, replacing, to_json
 
 if TYPE_CHECKING:
     from outlap.training.session import TrainingConfig
@@ -106,20 +104,18 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
     folder = Path(folder)
     if not (folder / "config.yaml").is_file():
         raise OutlapError(f"{folder}: is not a run folder, it has no config.yaml; make one with outlap train")
-    return Run(folder, load_config(_config_class(folder / "config.yaml"), folder / "config.yaml"))
+    path = folder / "config.yaml"
+    content = read_yaml(path)
+    return Run(folder, validate(_config_class(content, path), content, str(path)))
 
 
-def _config_class(path: Path) -> type[TrainingConfig]:
-    """The configuration of the algorithm that a file names; PPO's where it names none."""
+def _config_class(content: Any, path: Path) -> type[TrainingConfig]:
+    """The configuration of the algorithm that a file's content names; PPO's where it names none."""
     from outlap.training.mql import MQLConfig
     from outlap.training.ppo import PPOConfig
 
     classes: dict[str, type[TrainingConfig]] = {"ppo": PPOConfig, "mql": MQLConfig}
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, yaml.YAMLError):
-        return PPOConfig  # to load it will say what is wrong
-    name = content.get("algorithm", "ppo") if isinstance(content, dict) else "ppo"
+    name = content.get("algorithm", "ppo") if isinstance(content, Mapping) else "ppo"
     if name not in classes:
         raise OutlapError(f"{path}: algorithm is {name!r:.60}; must be one of {', '.join(classes)}")
     return classes[name]
@@ -128,12 +124,8 @@ def _config_class(path: Path) -> type[TrainingConfig]:
 def save_checkpoint(run: Run, model: Any, name: str) -> Path:
     """Write a Stable-Baselines3 model beside its place and rename it there; drop the oldest checkpoints."""
     path = run.folder / name
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial.zip")
-    try:
+    with replacing(path) as partial:
         model.save(partial)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     for old in run.checkpoints()[CHECKPOINTS_KEPT:]:
         old.unlink(missing_ok=True)
     return path

@@ -38,6 +38,7 @@ class TrainingConfig(Config):
     seed: int = Field(default=0, ge=0)
     learning_rate: float = Field(default=5e-4, gt=0)
     learning_rate_decay: bool = True  # linearly to zero at total_steps
+    gamma: float = Field(default=0.99, gt=0, le=1)
     device: str = "cpu"
     threads: int = Field(default=0, ge=0)  # of PyTorch; 0 = one a core
     checkpoint_every: int = Field(default=250_000, gt=0)  # actions

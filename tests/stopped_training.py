@@ -1,0 +1,20 @@
+"""A training that is stopped on its way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from outlap.training.session import Progress, TrainingConfig, train
+
+
+def stopped_after(steps: int, config: TrainingConfig, folder: Path) -> None:
+    """Train as Ctrl-C would end it, after so many actions."""
+
+    def stop(progress: Progress) -> None:
+        if progress.steps >= steps:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config, folder, on_progress=stop)
