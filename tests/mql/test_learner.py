@@ -65,8 +65,8 @@ def plain_losses(p: MQLPolicy, batch, n_steps: int):
 
     def z(columns: torch.Tensor) -> torch.Tensor:
         steps, valid = p.steps(batch.windows)
-        rows = torch.arange(len(columns))[:, None]
-        return p.context(p.context.project(steps[rows, columns]), valid[rows, columns])
+        each, rows = torch.arange(len(columns)), columns.t()
+        return p.context(p.context.project(steps[rows, each]), valid[rows, each], len(rows))
 
     here = torch.arange(5)[None].expand(len(batch.action), 5)
     there = here + torch.as_tensor(batch.steps)[:, None]

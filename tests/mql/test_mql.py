@@ -15,7 +15,7 @@ from outlap.errors import OutlapError
 from outlap.mql.adaptation import AdaptationSettings, adapt, features
 from outlap.mql.context_vec_env import ContextVecEnv
 from outlap.mql.mql import MQL
-from outlap.mql.propensity import AdaptiveBetaClip, FixedClip, NoClip, effective_sample_size
+from outlap.mql.propensity import AdaptiveBetaClip, FixedClip, NoClip, fit_propensity
 from toy_tasks import HiddenGoal
 
 TOY: dict[str, Any] = {
@@ -165,10 +165,14 @@ def test_it_learns_without_rewards_in_the_context() -> None:
 def test_features_tell_tasks_apart(meta: MQL) -> None:
     rng = np.random.default_rng(0)
     terms = meta.policy.window_terms
-    batch = meta.replay_buffer.gather(meta.replay_buffer.sample(100, rng), history=10, gamma=0.9, terms=terms)
+    batch = meta.replay_buffer.gather(meta.replay_buffer.sample(1000, rng), history=10, gamma=0.9, terms=terms)
     z = features(meta.policy, batch)
-    assert z.shape == (100, 64)
-    assert effective_sample_size(np.exp(z[:, 0])) < 1.0
+    assert z.shape == (1000, 32)
+    goals = np.array([float(str(task).removeprefix("goal ")) for task in meta.replay_buffer.tasks])
+    left = goals[batch.task] < 0.0
+    assert fit_propensity(z[left], z[~left], 1.0).accuracy > 0.7
+    shuffled = rng.permutation(left)
+    assert fit_propensity(z[shuffled], z[~shuffled], 1.0).accuracy < 0.6
 
 
 def test_a_broken_replay_is_named(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from outlap.mql.gru import GRULayer
-from outlap.mql.networks import PRESETS, ContextEncoder, TwinMLP
+from outlap.mql.gru import gru
+from outlap.mql.networks import PRESETS, ContextEncoder, ScanConvolution, TwinMLP
 
 
 def space(**sizes: int) -> gym.spaces.Dict:
@@ -16,10 +16,11 @@ def space(**sizes: int) -> gym.spaces.Dict:
 
 
 @pytest.mark.parametrize("layers", [1, 2])
-def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # kernels of our own, and operations of PyTorch
+def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int, dtype: torch.dtype) -> None:
     torch.manual_seed(0)
-    ours = ContextEncoder(7, 5, layers).double()
-    theirs = torch.nn.GRU(7, 5, layers, batch_first=True).double()
+    ours = ContextEncoder(7, 5, layers).to(dtype)
+    theirs = torch.nn.GRU(7, 5, layers).to(dtype)
     pairs = []
     for i in range(layers):
         for kind, part in (("ih", ours.inputs[i]), ("hh", ours.recurrent[i])):
@@ -27,9 +28,9 @@ def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int)
             pairs.append((part.bias, getattr(theirs, f"bias_{kind}_l{i}")))
     for mine, other in pairs:
         other.data.copy_(mine.data)
-    steps = torch.randn(4, 6, 7, dtype=torch.float64, requires_grad=True)
-    weight = torch.randn(4, 5, dtype=torch.float64)
-    z = ours(ours.project(steps), torch.ones(4, 6, dtype=torch.float64))
+    steps = torch.randn(6, 4, 7, dtype=dtype, requires_grad=True)
+    weight = torch.randn(4, 5, dtype=dtype)
+    z = ours(ours.project(steps), torch.ones(6, 4, dtype=dtype), 6)
     expected = theirs(steps)[1][-1]
     torch.testing.assert_close(z, expected)
     gradients = torch.autograd.grad((z * weight).sum(), [steps, *(mine for mine, _ in pairs)])
@@ -38,23 +39,57 @@ def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int)
         torch.testing.assert_close(got, want)
 
 
-def test_the_gradient_is_that_of_finite_differences_where_steps_are_missing() -> None:
+@pytest.mark.parametrize("length", [1, 4])
+def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_too(length: int) -> None:
     torch.manual_seed(1)
-    projected = torch.randn(5, 3, 6, dtype=torch.float64, requires_grad=True)
-    valid = torch.tensor([[0, 1, 1], [0, 1, 1], [1, 1, 0], [1, 1, 1], [1, 1, 1]], dtype=torch.float64)[..., None]
-    weight = torch.randn(6, 2, dtype=torch.float64, requires_grad=True)
-    bias = torch.randn(6, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda p, w, b: GRULayer.apply(p, valid, w, b), (projected, weight, bias))
+    n, hidden, rows = 19, 21, 6  # neither a multiple of the lanes of a register
+    projected = (4.0 * torch.randn(rows, n, 3 * hidden)).requires_grad_()
+    valid = (torch.arange(rows)[:, None] >= torch.randint(0, 4, (n,))).float()
+    first = torch.randint(0, rows - length + 1, (n,))
+    weight = torch.randn(3 * hidden, hidden, requires_grad=True)
+    bias = torch.randn(3 * hidden, requires_grad=True)
+    upstream = torch.randn(length, n, hidden)
+    found = gru(projected, valid, first, length, weight, bias)
+    wide = [tensor.detach().double().requires_grad_() for tensor in (projected, weight, bias)]
+    expected = gru(wide[0], valid.double(), first, length, wide[1], wide[2])
+    torch.testing.assert_close(found, expected.float(), atol=2e-6, rtol=0.0)
+    gradients = torch.autograd.grad((found * upstream).sum(), (projected, weight, bias))
+    wanted = torch.autograd.grad((expected * upstream.double()).sum(), wide)
+    for got, want in zip(gradients, wanted, strict=True):
+        torch.testing.assert_close(got, want.float(), atol=1e-5, rtol=1e-5)
+    with torch.no_grad():
+        torch.testing.assert_close(gru(projected, valid, first, length, weight, bias), found, atol=0.0, rtol=0.0)
+
+
+def test_gates_saturate_where_inputs_are_huge_and_hide_no_nan() -> None:
+    inputs = torch.tensor([-1e30, -30.0, 0.0, 30.0, 1e30, float("nan")])
+    projected = inputs[None, :, None].expand(1, 6, 3)
+    states = gru(projected, torch.ones(1, 6), torch.zeros(6, dtype=torch.int64), 1, torch.zeros(3, 1), torch.zeros(3))
+    torch.testing.assert_close(
+        states[0, :, 0], torch.tensor([-1.0, -1.0, 0.0, 0.0, 0.0, float("nan")]), atol=1e-7, rtol=0.0, equal_nan=True
+    )
 
 
 def test_what_was_before_an_episode_changes_nothing() -> None:
     torch.manual_seed(2)
     encoder = ContextEncoder(3, 8, 2)
-    steps = torch.randn(2, 6, 3)
-    valid = torch.ones(2, 6)
-    valid[:, :2] = 0.0
-    z = encoder(encoder.project(steps), valid)
-    torch.testing.assert_close(z, encoder(encoder.project(steps[:, 2:]), valid[:, 2:]))
+    steps = torch.randn(6, 2, 3)
+    valid = torch.ones(6, 2)
+    valid[:2] = 0.0
+    z = encoder(encoder.project(steps), valid, 6)
+    torch.testing.assert_close(z, encoder(encoder.project(steps[2:]), valid[2:], 4))
+
+
+def test_a_convolution_without_overlap_is_pytorchs() -> None:
+    torch.manual_seed(4)
+    ours = ScanConvolution(20, 6)  # 20 beams: 7 are missing to 27
+    theirs = torch.nn.Conv1d(1, ours.channels, ours.width, stride=ours.width)
+    theirs.weight.data.copy_(ours.groups.weight.data[:, None])
+    assert theirs.bias is not None
+    theirs.bias.data.copy_(ours.groups.bias.data)
+    scan = torch.randn(3, 20)
+    groups = torch.relu(theirs(torch.nn.functional.pad(scan, (0, 7))[:, None]))
+    torch.testing.assert_close(ours(scan), torch.relu(ours.last(groups.transpose(1, 2).flatten(1))))
 
 
 def test_twin_critics_are_two_networks_of_their_own() -> None:

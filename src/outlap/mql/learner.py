@@ -117,20 +117,15 @@ def td3_update(
 
 def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:
     """z where the transitions depart, and, without gradient, where they arrive."""
-    n, length = policy.history, batch.windows.action.shape[1]
     if not policy.uses_context:
         zero = torch.zeros(len(batch.action), policy.context.hidden, device=policy.device)
         return zero, zero
     steps, valid = policy.steps(batch.windows)
     projected = policy.context.project(steps)  # once, for windows that share all rows but the ends
-    departing = policy.context(projected[:, :n], valid[:, :n])
+    departing = policy.context(projected, valid, policy.history)
     with torch.no_grad():
-        if length == n + 1:
-            arriving = policy.context(projected[:, 1:], valid[:, 1:])
-        else:
-            rows = torch.as_tensor(batch.steps, device=policy.device)[:, None] + torch.arange(n, device=policy.device)
-            each = torch.arange(len(rows), device=policy.device)[:, None]
-            arriving = policy.context(projected[each, rows], valid[each, rows])
+        later = torch.as_tensor(batch.steps, device=policy.device)
+        arriving = policy.context(projected, valid, policy.history, first=later)
     return departing, arriving
 
 

@@ -71,6 +71,7 @@ class MQLPolicy(BasePolicy):
         self.actor_target.requires_grad_(False)
         self.critic_target.requires_grad_(False)
         self.shares_encoder = shape.shared_encoder
+        self.trains_in_bfloat16 = shape.trains_in_bfloat16
         self.make_optimizers(lr_schedule(1.0))
 
     def make_optimizers(self, learning_rate: float) -> None:
@@ -90,22 +91,24 @@ class MQLPolicy(BasePolicy):
         ]
 
     def steps(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """What the context encoder reads: (n, length, inputs), and which steps there were, (n, length)."""
-        device = self.device
-        terms = {name: to_tensor(windows.observation[name], device) for name in self.window_terms}
-        read = [to_tensor(windows.action, device)]
+        """What the context encoder reads: (length, n, inputs), and which steps there were, (length, n)."""
+        terms = {name: self._by_step(windows.observation[name]) for name in self.window_terms}
+        read = [self._by_step(windows.action)]
         if self.uses_reward:
             read.append(terms[PREVIOUS_REWARD])
         embed = self.critic.encoder.encoders if self.shares_encoder else None
         read += [embed[name](terms[name]) if embed is not None else terms[name] for name in self.context_terms]
-        return torch.cat(read, -1), to_tensor(windows.valid, device)
+        return torch.cat(read, -1), self._by_step(windows.valid)
+
+    def _by_step(self, rows: np.ndarray) -> Tensor:
+        return to_tensor(rows.swapaxes(0, 1), self.device)
 
     def encode(self, windows: Windows) -> Tensor:
         """The context z (n, hidden) at the end of each window."""
         if not self.uses_context:
             return torch.zeros(len(windows.action), self.context.hidden, device=self.device)
         steps, valid = self.steps(windows)
-        return self.context(self.context.project(steps), valid)
+        return self.context(self.context.project(steps), valid, windows.valid.shape[1])
 
     def act(self, observation: Mapping[str, np.ndarray], windows: Windows) -> np.ndarray:
         """Actions in [-1, 1], (n, actions), without noise."""
