@@ -11,7 +11,7 @@ INSTALLED := $(VENV)/.installed
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED)  ## train on built-in circuits and evaluate on held-out ones (at most 5 minutes)
+demo: $(INSTALLED)  ## meta-train on built-in circuits, adapt to held-out ones and race there (at most 5 minutes)
 	$(BIN)/outlap demo
 
 test: $(INSTALLED)  ## run the tests (OUTLAP_TRACKS=FOLDER adds those that need real circuits)

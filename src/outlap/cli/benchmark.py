@@ -235,7 +235,8 @@ def _measure_mql(settings: BenchmarkMQL, preset: str, beams: int, batch: int) ->
     config = MQLConfig.model_validate(
         {
             "env": env, "preset": preset, "batch_size": batch, "device": settings.device, "num_envs": MQL_WORLDS,
-            "n_steps": 1, "learning_starts": FILLED * MQL_WORLDS, "buffer_size": 1000 * MQL_WORLDS,
+            "n_steps": 1, "updates_per_step": 1, "learning_starts": FILLED * MQL_WORLDS,
+            "buffer_size": 1000 * MQL_WORLDS,
         }
     )  # fmt: skip
     model = config.make_model(SB3VecEnv(MQL_WORLDS, **dict(env)))

@@ -13,19 +13,19 @@ from outlap.cli.output import CommandResult
 
 @dataclass(frozen=True)
 class Demo:
-    """Train a policy on the built-in training circuits, then race it on circuits that it never saw.
+    """Meta-train a policy on the built-in training circuits; race it on three that it never saw, adapt, race again.
 
-    The same as `outlap train ppo` and `outlap evaluate` with their defaults, but shorter.
+    The same as `outlap train mql` and `outlap adapt --clip abc` with their defaults, but shorter.
     """
 
-    steps: int = 1_200_000
+    steps: int = 350_000
     """Actions to train for, all worlds together."""
 
     episodes: int = 30
-    """To race on each held-out circuit."""
+    """To race on each held-out circuit before the adaptation to it, and after."""
 
     seed: int = 0
-    """Of the training and of the evaluation."""
+    """Of the training, the adaptation and the episodes."""
 
     out: Path | None = None
     """The run folder; by default a new one under runs/."""
@@ -37,20 +37,20 @@ class Demo:
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
-        from outlap.cli.evaluate import Evaluate
-        from outlap.cli.train import TrainPPO
+        from outlap.cli.adapt import Adapt
+        from outlap.cli.train import TrainMQL
         from outlap.config import validate
         from outlap.track.generate import BUILTIN_HELD_OUT
-        from outlap.training.ppo import PPOConfig
+        from outlap.training.mql import MQLConfig
 
         settings = {"total_steps": self.steps, "seed": self.seed, "held_out_tracks": BUILTIN_HELD_OUT}
-        config = validate(PPOConfig, settings, "outlap demo")
+        config = validate(MQLConfig, settings, "outlap demo")
         folder = self.out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
-        trained = TrainPPO(settings=config, out=folder, quiet=self.quiet).run()
-        evaluated = Evaluate(str(folder), episodes=self.episodes, seed=self.seed, quiet=self.quiet).run()
+        trained = TrainMQL(settings=config, out=folder, quiet=self.quiet).run()
+        adapted = Adapt(folder, clip=("abc",), seeds=1, episodes=self.episodes, seed=self.seed, quiet=self.quiet).run()
 
         def show(console) -> None:
             trained.show(console)
-            evaluated.show(console)
+            adapted.show(console)
 
-        return CommandResult({"training": trained.data, "evaluation": evaluated.data}, show)
+        return CommandResult({"training": trained.data, "adaptation": adapted.data}, show)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from outlap.envs.race_config import RaceConfig
+from outlap.envs.rewards import RewardConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.session import TrainingConfig
 
@@ -20,20 +21,24 @@ class MQLConfig(TrainingConfig):
 
     algorithm: Literal["mql"] = "mql"  # type: ignore[assignment] - narrower than the base class's
     env: RaceConfig = PPOConfig().env.model_copy(
-        update={"observation": ("scan", "vel", "heading", "previous_action", "previous_reward")}
+        update={
+            "observation": ("scan", "vel", "heading", "previous_action", "previous_reward"),
+            # Crashes that cost all from the start teach it to creep.
+            "reward": RewardConfig(collision_steps=3e6),
+        }
     )
-    total_steps: int = Field(default=1_500_000, gt=0)  # actions, all worlds together
+    total_steps: int = Field(default=3_500_000, gt=0)  # actions, all worlds together
     preset: Literal["fast", "paper"] = "fast"  # networks, see mql.networks
     history: int = Field(default=10, ge=1)  # steps that the context is made of
     uses_reward: bool = True  # whether the context is told the rewards, which a car does not have
     uses_context: bool = True  # without it, it is TD3
     buffer_size: int = Field(default=1_000_000, ge=1)  # steps, all worlds together
     learning_starts: int = Field(default=20_000, ge=0)  # actions at random before the first update
-    batch_size: int = Field(default=512, ge=2)
-    updates_per_step: int = Field(default=1, ge=1)  # for every action of all worlds
+    batch_size: int = Field(default=256, ge=2)
+    updates_per_step: int = Field(default=2, ge=1)  # for every action of all worlds
     n_steps: int = Field(default=3, ge=1)  # of a return
     tau: float = Field(default=0.005, gt=0, le=1)
-    exploration_noise: float = Field(default=0.15, ge=0)
+    exploration_noise: float = Field(default=0.1, ge=0)
     policy_noise: float = Field(default=0.2, ge=0)
     noise_clip: float = Field(default=0.5, ge=0)
     policy_delay: int = Field(default=2, ge=1)
