@@ -48,7 +48,8 @@ def test_a_stopped_run_goes_on_with_its_replay() -> None:
         np.testing.assert_array_equal(after.observation[name][: before.added], before.observation[name][: before.added])
     model = MQL.load(run.policy_path, device="cpu")
     assert model.num_timesteps == 640
-    assert model._n_updates == (640 - 64) // 8 - 1  # all but the one that the stop came before
+    # All but those that the stop came before.
+    assert model._n_updates == SMALL.updates_per_step * ((640 - 64) // 8 - 1)
     assert set(after.tasks) == {"ring5"}
 
 
