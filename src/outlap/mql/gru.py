@@ -106,7 +106,7 @@ def _flat(*tensors: Tensor) -> list[np.ndarray]:
 
 
 _f4, _u8 = np.float32, np.uint64
-_2, _3, _4 = _u8(2), _u8(3), _u8(4)
+_2, _3 = _u8(2), _u8(3)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
