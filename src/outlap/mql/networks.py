@@ -47,13 +47,14 @@ class ContextEncoder(nn.Module):
         zeros = torch.zeros(projected.shape[1], dtype=torch.int64, device=projected.device)
         first = zeros if first is None else first
         steps = projected
-        for inputs, recurrent in zip(self.inputs, self.recurrent, strict=True):
+        for layer, (inputs, recurrent) in enumerate(zip(self.inputs, self.recurrent, strict=True)):
             assert isinstance(recurrent, nn.Linear)
-            if steps is not projected:
+            if layer:
                 steps = inputs(steps)
+            if layer == 1:  # from here on rows are those of the windows
+                rows = first + torch.arange(length, device=first.device).unsqueeze(-1)
+                valid, first = valid[rows, torch.arange(len(first), device=first.device)], zeros
             steps = gru(steps, valid, first, length, recurrent.weight, recurrent.bias)
-            rows = first + torch.arange(length, device=first.device).unsqueeze(-1)
-            valid, first = valid[rows, torch.arange(len(first), device=first.device)], zeros
         return steps[-1]
 
 
