@@ -37,7 +37,7 @@ def test_passing_a_slower_car_counts_once(big_circle, put, follow, s):
     env = duel(big_circle, opponent_speed=1.0)
     put(env, np.array([[s - 1.5, 0.6, 0.0, 4.0], [s, 0.0, 0.0, 1.0]]))
     rewards, info = drive(env, follow, 4.0, 3.0, 0.6)
-    assert env.race.distance[0] > env.race.worlds.distance[0, 1] + 4.0
+    assert env.race.distance[0, 0] > env.race.worlds.distance[0, 1] + 4.0
     assert info["overtakes"][0] == 1
     assert info["places_lost"][0] == 0
     assert [reward for reward in rewards if reward] == [20.0]
@@ -48,7 +48,7 @@ def test_the_overtake_counts_when_the_lead_is_a_car_long(big_circle, put, follow
     put(env, np.array([[8.5, 0.6, 0.0, 3.0], [10.0, 0.0, 0.0, 1.0]]))
     while True:
         _, reward, *_ = env.step(follow(env, -0.4, 0.6))
-        lead = env.race.distance[0] - env.race.worlds.distance[0, 1]
+        lead = env.race.distance[0, 0] - env.race.worlds.distance[0, 1]
         if reward[0]:
             break
         assert lead <= LENGTH + 1e-6
@@ -91,7 +91,7 @@ def test_being_lapped_is_no_place_lost(circle, put, follow):
     env = duel(circle, opponent_speed=4.0)
     put(env, np.array([[12.0, 0.7, 0.0, 0.0], [10.0, -0.2, 0.0, 4.0]]))
     _, info = drive(env, follow, 0.0, 16.0, 0.7)
-    assert env.race.worlds.distance[0, 1] - env.race.distance[0] > 1.5 * circle.centerline.length
+    assert env.race.worlds.distance[0, 1] - env.race.distance[0, 0] > 1.5 * circle.centerline.length
     assert info["overtakes"][0] == 0
     assert info["places_lost"][0] == 1
 
@@ -102,7 +102,7 @@ def test_neither_overtakes_nor_places_lost_by_reversing_over_the_line(big_circle
     put(env, np.array([[0.3, 0.6, 0.0, -2.0], [-4.0, -0.6, 0.0, 0.0]]))
     for _ in range(20):
         info = env.step(np.array([[0.0, -1.0]]))[-1]
-    assert -1.0 < env.race.distance[0] < -0.01, "the test needs to cross the line backwards"
+    assert -1.0 < env.race.distance[0, 0] < -0.01, "the test needs to cross the line backwards"
     assert info["overtakes"][0] == info["places_lost"][0] == 0
 
 
@@ -119,7 +119,7 @@ def test_places_change_only_by_a_cars_length(big_circle, put):
     for lead, gained, lost in sequence:
         distance[0] = 12.0 + lead, 12.0
         race.advance(0.3)
-        assert (race.places_gained[0], race.places_lost[0]) == (gained, lost), lead
+        assert (race.places_gained[0, 0], race.places_lost[0, 0]) == (gained, lost), lead
 
 
 def test_the_order_at_the_start_is_the_order_on_the_track(big_circle):
@@ -132,7 +132,7 @@ def test_the_order_at_the_start_is_the_order_on_the_track(big_circle):
     x, y = env.race.worlds.state[..., 0].astype(float), env.race.worlds.state[..., 1].astype(float)
     along = np.arctan2(y, x) * 8.0  # the field is far shorter than half a lap
     in_front = along[:, :1] > along
-    np.testing.assert_array_equal(env.race.ahead[:, 1:], in_front[:, 1:])
+    np.testing.assert_array_equal(env.race.ahead[:, 0, 1:], in_front[:, 1:])
     assert 20 < in_front[:, 1:].sum() < 100
     assert (along[:, 1:] < 0.0).any()
     assert (along[:, 1:] > 0.0).any()

@@ -37,7 +37,7 @@ def test_the_reward_is_the_sum_of_what_the_info_logs(ellipse, follow):
     used, episodes = dict.fromkeys(REWARD_TERMS, 0.0), 0
     for _ in range(250):
         actions = np.clip(follow(env, -0.3, 0.6) + rng.normal(0.0, 0.1, (4, 2)), -1.0, 1.0)
-        actions[3, 1] = STANDSTILL
+        actions[2, 0], actions[3, 1] = 1.0, STANDSTILL  # one into the wall, one nowhere
         _, rewards, terminated, truncated, info = env.step(actions)
         over = terminated | truncated
         logged = np.zeros(4)
@@ -109,7 +109,7 @@ def test_milestones_count_once_and_not_again_after_reversing(circle, put):
     put(env, [length - 4.0, 0.0, 0.0, 2.0])
     counts = []
     for speed_action, there in ((-0.48, 5.5), (-0.72, 4.5), (-0.48, 5.5), (-0.48, 10.5)):
-        count, progress = 0.0, env.race.distance[0] - env.race.start[0]
+        count, progress = 0.0, env.race.distance[0, 0] - env.race.start[0, 0]
         while (progress - there) * (speed_action - STANDSTILL) < 0.0:
             _, reward, terminated, truncated, info = env.step(np.array([[0.196, speed_action]]))
             assert not (terminated | truncated).any()

@@ -7,6 +7,8 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
 from outlap.envs.race_vector_env import RaceVectorEnv
@@ -171,3 +173,74 @@ def test_a_place_too_narrow_for_the_car_is_avoided():
 def test_wrong_values_are_refused(ellipse, field, value):
     with pytest.raises(OutlapError, match=f"start.{field}"):
         RaceVectorEnv(1, tracks=[ellipse], beams=0, start={field: value})
+
+
+FORMATIONS = ("queue", "behind", "grid", "scattered")
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    formation=st.sampled_from(FORMATIONS), cars=st.integers(2, 8), offset=st.floats(0.0, 1.0),
+    heading_error=st.floats(0.0, 1.0), gap=st.floats(0.0, 1.5), spread=st.floats(0.0, 1.0), seed=st.integers(0, 10**6),
+)  # fmt: skip
+def test_no_formation_ever_starts_with_a_contact(big_circle, formation, cars, offset, heading_error, gap, spread, seed):
+    """Rectangles against each other, whatever the formation: cars of many sizes, bumper to bumper if need be."""
+    env = RaceVectorEnv(
+        10, tracks=[big_circle], num_cars=cars, beams=0, vehicle={"length": (0.4, 0.8), "width": (0.25, 0.4)},
+        start={"formation": formation, "offset": offset, "heading_error": heading_error, "gap": (gap, gap + spread)},
+    )  # fmt: skip
+    env.reset(seed=seed)
+    assert not env.race.worlds.contact.any()
+    for poses, sizes in zip(
+        env.race.worlds.state[..., [0, 1, 4]].astype(float),
+        env.race.worlds.params[..., [LENGTH, WIDTH]].astype(float),
+        strict=True,
+    ):
+        bodies = [corners(pose, *size) for pose, size in zip(poses, sizes, strict=True)]
+        assert all(apart(a, b) for a, b in combinations(bodies, 2))
+
+
+def in_formation(track: Track, formation: str, cars: int, worlds: int = 200, **start) -> RaceVectorEnv:
+    env = RaceVectorEnv(
+        worlds, tracks=[track], num_cars=cars, beams=0, start={"formation": formation, "heading_error": 0.0, **start}
+    )
+    env.reset(seed=0)
+    return env
+
+
+def test_behind_puts_the_ego_last_by_the_drawn_gap(big_circle):
+    distance = in_formation(big_circle, "behind", 3, gap=(1.0, 3.0)).race.worlds.distance
+    assert (distance[:, 0] < distance[:, 1:].min(axis=1)).all()
+    gaps = distance[:, 1:].min(axis=1) - distance[:, 0] - 0.58
+    assert stats.kstest(gaps, "uniform", args=(1.0, 2.0)).pvalue > 1e-5
+    assert 60 < (distance[:, 1] > distance[:, 2]).sum() < 140, "the opponents' own order is drawn"
+
+
+def test_a_grid_stands_left_and_right_by_turns(big_circle):
+    worlds = in_formation(big_circle, "grid", 5, gap=(0.0, 0.0)).race.worlds
+    order = np.argsort(-worlds.distance, axis=1)
+    side = np.take_along_axis(worlds.frenet[..., 1], order, axis=1)
+    room = 1.2 - 0.5 * math.hypot(0.58, 0.31) - 0.1
+    np.testing.assert_allclose(side, np.tile(0.5 * room * np.array([1, -1, 1, -1, 1]), (200, 1)), atol=2e-3)
+    assert set(order[:, 0]) == set(range(5)), "every car can be on pole"
+    along = -np.diff(np.take_along_axis(worlds.distance, order, axis=1), axis=1)
+    np.testing.assert_allclose(along, 0.58 + 0.1, atol=1e-6)
+
+
+def test_scattered_cars_are_anywhere_on_the_lap_but_a_gap_apart(big_circle):
+    worlds = in_formation(big_circle, "scattered", 4, gap=(1.5, 9.0)).race.worlds
+    length = big_circle.centerline.length
+    s = np.sort(worlds.distance % length, axis=1)
+    between = np.concatenate([np.diff(s, axis=1), s[:, :1] + length - s[:, -1:]], axis=1)
+    assert between.min() >= 0.58 + 1.5 - 1e-6
+    assert between.min() < 0.58 + 1.7
+    away = worlds.distance[:, 1:] - worlds.distance[:, :1]
+    assert np.abs(away).max() <= 0.5 * length + 1e-6, "ahead or behind by the shorter way round"
+    free = length - 4 * 2.08
+    # Of a uniform arrangement: the room before the next car, of four that share what is free.
+    assert stats.kstest((between[:, 0] - 2.08) / free, stats.beta(1, 3).cdf).pvalue > 1e-5
+
+
+def test_more_cars_than_fit_are_said_not_to(circle):
+    with pytest.raises(OutlapError, match=r"found no start free of contact.*long enough for all"):
+        in_formation(circle, "scattered", 60, worlds=2)

@@ -76,7 +76,7 @@ def test_laps_done_truncate(circle, put, follow, laps):
     driven = [0.0]
 
     def go(env: RaceVectorEnv) -> np.ndarray:
-        driven.append(env.race.distance[0] - env.race.start[0])
+        driven.append(env.race.distance[0, 0] - env.race.start[0, 0])
         return follow(env, -0.2)
 
     outcome, terminated, truncated, _ = finish(env, go)

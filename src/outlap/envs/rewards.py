@@ -1,6 +1,6 @@
 """Reward terms, a function a term, and the presets that weigh them.
 
-A term is unweighted: (worlds,) float. The reward is the sum of weight × term. Constants: `RewardConfig`.
+A term is unweighted: (worlds,) float of one car. The reward is the sum of weight × term. Constants: `RewardConfig`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,9 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from outlap.config import Config
-from outlap.envs.race import EGO, Race
-from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
-from outlap.simulator.vehicle import A_MAX, MU, V_MAX
-from outlap.track.centerline import CURVATURE
-from outlap.track.track import Track
-
-LATERAL_SHARE = 0.8  # of mu g that the reference speed of a track without a raceline uses
-GRAVITY = 9.81  # [m/s^2]
+from outlap.envs.race import Race
+from outlap.envs.racing_line import LINE_SPEED
+from outlap.simulator.vehicle import V_MAX
 
 
 class RewardConfig(Config):
@@ -55,59 +50,59 @@ class RewardConfig(Config):
         return {name: weight for name, weight in weights.items() if weight != 0.0}
 
 
-def milestone(race: Race, config: RewardConfig) -> np.ndarray:
+def milestone(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """Milestones passed for the first time: one at each 1 / milestones of a lap from the start."""
     step = race.length / config.milestones
-    passed = np.floor((race.farthest - race.start) / step)
-    return passed - np.floor((race.farthest_before - race.start) / step)
+    passed = np.floor((race.farthest[:, car] - race.start[:, car]) / step)
+    return passed - np.floor((race.farthest_before[:, car] - race.start[:, car]) / step)
 
 
-def progress(race: Race, config: RewardConfig) -> np.ndarray:
+def progress(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """Advance along the centreline [m]."""
-    return race.distance - race.distance_before
+    return race.distance[:, car] - race.distance_before[:, car]
 
 
-def lap_progress(race: Race, config: RewardConfig) -> np.ndarray:
+def lap_progress(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """Advance along the centreline [laps]."""
-    return progress(race, config) / race.length
+    return progress(race, car, config) / race.length
 
 
-def collision(race: Race, config: RewardConfig) -> np.ndarray:
-    """-(1 + (c_max - 1) tanh(t / T)) where the ego crashed: a penalty that grows over training."""
+def collision(race: Race, car: int, config: RewardConfig) -> np.ndarray:
+    """-(1 + (c_max - 1) tanh(t / T)) where the car crashed: a penalty that grows over training."""
     growth = np.tanh(race.training_steps / config.collision_steps)
-    return np.where(race.crashed, -(1.0 + (config.collision_max - 1.0) * growth), 0.0)
+    return np.where(race.crashed[:, car], -(1.0 + (config.collision_max - 1.0) * growth), 0.0)
 
 
-def stall(race: Race, config: RewardConfig) -> np.ndarray:
-    """-1 where the episode ends because the ego gets no further: else a careful policy would rather stand."""
-    return -race.stalled.astype(np.float64)
+def stall(race: Race, car: int, config: RewardConfig) -> np.ndarray:
+    """-1 where the episode ends because the car gets no further: else a careful policy would rather stand."""
+    return -race.stalled[:, car].astype(np.float64)
 
 
-def velocity_matching(race: Race, config: RewardConfig) -> np.ndarray:
+def velocity_matching(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """-(v - v_ref)^2 w(t) [m^2/s^2]: w falls over training from 1 to 0 as a sigmoid."""
-    rows = race.line_rows(EGO, np.zeros(1))[:, 0]
-    reference = np.minimum(race.reference_speed[rows], race.worlds.params[:, EGO, V_MAX])
+    rows = race.line_rows(car, np.zeros(1))[:, 0]
+    reference = np.minimum(race.racing_line[rows, LINE_SPEED], race.worlds.params[:, car, V_MAX])
     x = (race.training_steps - config.velocity_step) / config.velocity_width
     weight = 0.5 * (1.0 - np.tanh(0.5 * x))
-    return -weight * (race.speed - reference) ** 2
+    return -weight * (race.speed[:, car] - reference) ** 2
 
 
-def steering_change(race: Race, config: RewardConfig) -> np.ndarray:
+def steering_change(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """-|change of the steering action|."""
-    return -np.abs(race.actions[:, EGO, 0] - race.actions_before[:, EGO, 0])
+    return -np.abs(race.actions[:, car, 0] - race.actions_before[:, car, 0])
 
 
-def speed_change(race: Race, config: RewardConfig) -> np.ndarray:
+def speed_change(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """-|change of the speed action|."""
-    return -np.abs(race.actions[:, EGO, 1] - race.actions_before[:, EGO, 1])
+    return -np.abs(race.actions[:, car, 1] - race.actions_before[:, car, 1])
 
 
-def overtake(race: Race, config: RewardConfig) -> np.ndarray:
+def overtake(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """Places gained less places lost."""
-    return (race.places_gained - race.places_lost).astype(np.float64)
+    return (race.places_gained[:, car] - race.places_lost[:, car]).astype(np.float64)
 
 
-REWARD_TERMS: dict[str, Callable[[Race, RewardConfig], np.ndarray]] = {
+REWARD_TERMS: dict[str, Callable[[Race, int, RewardConfig], np.ndarray]] = {
     "milestone": milestone,
     "progress": progress,
     "lap_progress": lap_progress,
@@ -141,41 +136,3 @@ REWARD_PRESETS: dict[str, dict[str, float]] = {
         "overtake": 20.0,
     },
 }
-
-
-def reference_speeds(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray) -> np.ndarray:
-    """The speed to match at every row of the atlas: float32 (rows,) [m/s].
-
-    The speed column of the track's raceline, at the arc lengths where its points lie. A track without one
-    gets the speed at which the centreline's curvature asks for LATERAL_SHARE of the grip, braking and
-    accelerating within a_max.
-
-    Args:
-        params: (N_PARAMS,) of a typical car: its mu, a_max and v_max count where there is no raceline.
-    """
-    out = np.empty(len(atlas.line), np.float32)
-    for number, track in enumerate(tracks):
-        first, rows = atlas.index[number, FIRST_ROW], atlas.index[number, ROWS]
-        spacing, length = atlas.frame[number, SPACING], track.centerline.length
-        s = np.arange(rows) * spacing
-        if track.raceline is not None:
-            at, _ = track.centerline.to_frenet(track.raceline.x, track.raceline.y)
-            speed = np.interp(s, at, track.raceline.speed, period=length)
-        else:
-            speed = _friction_limited(atlas.line[first : first + rows, CURVATURE], spacing, params)
-        out[first : first + rows] = speed
-    return out
-
-
-def _friction_limited(curvature: np.ndarray, spacing: float, params: np.ndarray) -> np.ndarray:
-    """A speed profile around a closed line: cornering limit, then braking backwards and accelerating forwards."""
-    lateral = LATERAL_SHARE * float(params[MU]) * GRAVITY
-    squared = np.minimum(lateral / np.maximum(np.abs(curvature), 1e-6), float(params[V_MAX]) ** 2)
-    gain = 2.0 * min(float(params[A_MAX]), lateral) * spacing
-    for order in (range(2 * len(squared), 0, -1), range(2 * len(squared))):
-        before = order[0] % len(squared)
-        for index in order:
-            i = index % len(squared)
-            squared[i] = min(squared[i], squared[before] + gain)
-            before = i
-    return np.sqrt(squared)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -38,8 +39,12 @@ class TaskSet:
     @property
     def max_delay(self) -> float:
         """The longest actuator delay that a task can have [s]."""
-        _, high = parameter_bounds(self.vehicle, self.actuators, self.lidar)
+        _, high = self._bounds
         return float(max(high[STEER_DELAY], high[SPEED_DELAY]))
+
+    @cached_property
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        return parameter_bounds(self.vehicle, self.actuators, self.lidar)
 
     def draw(self, keys: np.ndarray, episodes: np.ndarray, num_cars: int) -> tuple[np.ndarray, np.ndarray]:
         """The tasks of some worlds' next episodes; every car's parameters are drawn on their own.
@@ -54,7 +59,7 @@ class TaskSet:
             params: float32 (n, num_cars, N_PARAMS).
         """
         choice = uniform(keys, episodes, TRACK_STREAM, 1)[:, 0]
-        low, high = parameter_bounds(self.vehicle, self.actuators, self.lidar)
+        low, high = self._bounds
         share = uniform(keys, episodes, PARAMETER_STREAM, num_cars * N_PARAMS)
         share = share.reshape(len(keys), num_cars, N_PARAMS)
         params = (low + share * (high - low)).astype(np.float32)

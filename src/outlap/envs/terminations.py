@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from outlap.config import Config
-from outlap.envs.race import EGO, Race
+from outlap.envs.race import Race
 
 RUNNING, CRASH, FINISHED, TIMEOUT, STALLED = "", "crash", "finished", "timeout", "stalled"
 
@@ -20,22 +20,22 @@ class TerminationConfig(Config):
     stall_distance: float = Field(default=0.3, gt=0)  # [m]
 
 
-def finished(race: Race, config: TerminationConfig) -> np.ndarray:
-    """The ego has done its laps: bool (worlds,)."""
-    return (race.worlds.laps[:, EGO] >= config.laps) & (config.laps > 0)
+def finished(race: Race, car: int, config: TerminationConfig) -> np.ndarray:
+    """The car has done its laps: bool (worlds,)."""
+    return (race.worlds.laps[:, car] >= config.laps) & (config.laps > 0)
 
 
-def timeout(race: Race, config: TerminationConfig) -> np.ndarray:
+def timeout(race: Race, car: int, config: TerminationConfig) -> np.ndarray:
     """The time limit is reached: bool (worlds,)."""
     return (race.worlds.time >= config.time_limit - 1e-9) & (config.time_limit > 0)
 
 
-def stalled(race: Race, config: TerminationConfig) -> np.ndarray:
-    """The ego stands, reverses or circles: no new ground for a while: bool (worlds,)."""
-    return (race.worlds.time - race.farthest_time >= config.stall_time - 1e-9) & (config.stall_time > 0)
+def stalled(race: Race, car: int, config: TerminationConfig) -> np.ndarray:
+    """The car stands, reverses or circles: no new ground for a while: bool (worlds,)."""
+    return (race.worlds.time - race.farthest_time[:, car] >= config.stall_time - 1e-9) & (config.stall_time > 0)
 
 
-def outcomes(race: Race, config: TerminationConfig) -> np.ndarray:
-    """The outcome of each world's episode, RUNNING while it goes on: str (worlds,)."""
-    rules = [race.crashed, finished(race, config), timeout(race, config), stalled(race, config)]
+def outcomes(race: Race, car: int, config: TerminationConfig) -> np.ndarray:
+    """The outcome of each world's episode for a car, RUNNING while it goes on: str (worlds,)."""
+    rules = [race.crashed[:, car], finished(race, car, config), timeout(race, car, config), stalled(race, car, config)]
     return np.select(rules, [CRASH, FINISHED, TIMEOUT, STALLED], default=RUNNING)

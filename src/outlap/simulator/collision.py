@@ -18,7 +18,7 @@ from outlap.simulator.atlas import (
     to_grid,
 )
 
-FREE, HIT_WALL, HIT_CAR = 0, 1, 2
+FREE, HIT_WALL, HIT_CAR, REMOVED = range(4)  # REMOVED: a car that was taken off the track
 
 
 @njit(cache=True, error_model="numpy")

@@ -16,7 +16,7 @@ from outlap.seeding import hash64
 from outlap.simulator import state as column
 from outlap.simulator.actuators import acceleration, delay_steps, lag, steering_rate
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
-from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, rectangles_overlap, touches_wall
+from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, REMOVED, rectangles_overlap, touches_wall
 from outlap.simulator.dynamics import (
     KINEMATIC,
     integrate,
@@ -70,8 +70,8 @@ class Worlds(NamedTuple):
     lap_start: np.ndarray  # float64 (worlds, cars): time of the last crossing [s]; NaN on the out-lap
     laps: np.ndarray  # int64 (worlds, cars): laps completed, from line to line
     lap_time: np.ndarray  # float64 (worlds, cars): of the last completed lap [s]; NaN before
-    contact: np.ndarray  # uint8 (worlds, cars): FREE, HIT_WALL or HIT_CAR; a car in contact is parked
-    impact_speed: np.ndarray  # float32 (worlds, cars): at the contact [m/s]
+    contact: np.ndarray  # uint8 (worlds, cars): FREE, HIT_WALL, HIT_CAR or REMOVED; only a free car drives
+    impact_speed: np.ndarray  # float32 (worlds, cars): at the contact, relative to what was hit [m/s]
     scan: np.ndarray  # float32 (worlds, cars, beams) [m]
 
 
@@ -133,10 +133,12 @@ def _collide(atlas, worlds, w):
             x, y, yaw = _between(worlds, w, c, share)
             length, width = 0.5 * worlds.params[w, c, LENGTH], 0.5 * worlds.params[w, c, WIDTH]
             if touches_wall(atlas, track, x, y, yaw, length, width):
-                _park(worlds, w, c, x, y, yaw, HIT_WALL)
+                _park(worlds, w, c, x, y, yaw, HIT_WALL, abs(worlds.state[w, c, column.SPEED]))
         for c in range(cars):
             for other in range(c):
                 if worlds.contact[w, c] != FREE and worlds.contact[w, other] != FREE:
+                    continue
+                if worlds.contact[w, c] == REMOVED or worlds.contact[w, other] == REMOVED:
                     continue
                 x1, y1, yaw1 = _between(worlds, w, c, share)
                 x2, y2, yaw2 = _between(worlds, w, other, share)
@@ -145,8 +147,9 @@ def _collide(atlas, worlds, w):
                     x1, y1, yaw1, 0.5 * p1[LENGTH], 0.5 * p1[WIDTH],
                     x2, y2, yaw2, 0.5 * p2[LENGTH], 0.5 * p2[WIDTH],
                 ):  # fmt: skip
-                    _park(worlds, w, c, x1, y1, yaw1, HIT_CAR)
-                    _park(worlds, w, other, x2, y2, yaw2, HIT_CAR)
+                    impact = _relative_speed(worlds.state[w, c], worlds.state[w, other])
+                    _park(worlds, w, c, x1, y1, yaw1, HIT_CAR, impact)
+                    _park(worlds, w, other, x2, y2, yaw2, HIT_CAR, impact)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -163,13 +166,23 @@ def _between(worlds, w, c, share):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _park(worlds, w, c, x, y, yaw, contact):
+def _relative_speed(one, other):
+    """Of two cars [m/s], from their states."""
+    way1 = float(one[column.YAW] + one[column.SLIP])
+    way2 = float(other[column.YAW] + other[column.SLIP])
+    dx = one[column.SPEED] * math.cos(way1) - other[column.SPEED] * math.cos(way2)
+    dy = one[column.SPEED] * math.sin(way1) - other[column.SPEED] * math.sin(way2)
+    return math.sqrt(dx * dx + dy * dy)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _park(worlds, w, c, x, y, yaw, contact, impact_speed):
     """Stop a car where it made contact; a car that is parked already stays as it is."""
     if worlds.contact[w, c] != FREE:
         return
     state = worlds.state[w, c]
     worlds.contact[w, c] = contact
-    worlds.impact_speed[w, c] = abs(state[column.SPEED])
+    worlds.impact_speed[w, c] = impact_speed
     steer = state[column.STEER]
     state[:] = 0.0
     state[column.X], state[column.Y], state[column.YAW] = x, y, wrap_angle(float(yaw))
@@ -225,7 +238,7 @@ def _scan(atlas, constants, worlds, w, c):
     beam_cos, beam_sin = constants.beam_cos, constants.beam_sin
     cast_walls(atlas, worlds.track[w], x, y, yaw, beam_cos, beam_sin, p[MAX_RANGE], scan)
     for other in range(worlds.state.shape[1]):
-        if other == c:
+        if other == c or worlds.contact[w, other] == REMOVED:
             continue
         body, size = worlds.state[w, other], worlds.params[w, other]
         dx, dy = body[column.X] - x, body[column.Y] - y
@@ -270,8 +283,8 @@ def step_worlds(atlas, constants, worlds, commands, repeats):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _place(atlas, constants, worlds, w, c, start):
-    """Put a car on the track, at rest but for its speed along its own axis."""
+def _put(atlas, constants, worlds, w, c, start):
+    """Put a car on the track, at rest but for its speed along its own axis; returns the centreline's length [m]."""
     track = worlds.track[w]
     rows, spacing = atlas.index[track, ROWS], atlas.frame[track, SPACING]
     x, y, heading = frenet_point(atlas.line, atlas.index[track, FIRST_ROW], rows, spacing, start[0], start[1])
@@ -293,8 +306,16 @@ def _place(atlas, constants, worlds, w, c, start):
     worlds.lagged[w, c, 0] = 0.0
     worlds.lagged[w, c, 1] = speed
 
+    worlds.contact[w, c] = FREE
+    worlds.impact_speed[w, c] = 0.0
     worlds.frenet[w, c, ARC_LENGTH] = start[0]
-    length = _locate(atlas, worlds, w, c)
+    return _locate(atlas, worlds, w, c)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _place(atlas, constants, worlds, w, c, start):
+    """Put a car on the track for a new episode."""
+    length = _put(atlas, constants, worlds, w, c, start)
     # Unwrapped as given: of two cars, one before and one behind the line, the right one leads.
     worlds.distance[w, c] = start[0]
     from_line = start[0] - length * math.floor(start[0] / length + 0.5)
@@ -305,8 +326,6 @@ def _place(atlas, constants, worlds, w, c, start):
         worlds.lap_start[w, c] = 0.0
     worlds.laps[w, c] = 0
     worlds.lap_time[w, c] = math.nan
-    worlds.contact[w, c] = FREE
-    worlds.impact_speed[w, c] = 0.0
 
 
 # Apart from the parallel loop below, in which Numba would lose the assignment of rows.
@@ -338,3 +357,37 @@ def reset_worlds(atlas, constants, worlds, which, keys, tracks, params, starts):
     """
     for i in prange(which.shape[0]):
         _reset_world(atlas, constants, worlds, which[i], keys[i], tracks[i], params[i], starts[i])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _respawn(atlas, constants, worlds, w, c, clearance):
+    """Put a removed car back on the centreline where it left, if there is room; its clocks and distance go on."""
+    track = worlds.track[w]
+    start = (worlds.frenet[w, c, ARC_LENGTH], 0.0, 0.0, 0.0)
+    x, y, yaw = frenet_point(
+        atlas.line, atlas.index[track, FIRST_ROW], atlas.index[track, ROWS], atlas.frame[track, SPACING], start[0], 0.0
+    )
+    for other in range(worlds.state.shape[1]):
+        if other == c or worlds.contact[w, other] == REMOVED:
+            continue
+        dx, dy = worlds.state[w, other, column.X] - x, worlds.state[w, other, column.Y] - y
+        if dx * dx + dy * dy < clearance * clearance:
+            return
+    p = worlds.params[w, c]
+    if not touches_wall(atlas, track, x, y, yaw, 0.5 * p[LENGTH], 0.5 * p[WIDTH]):
+        _put(atlas, constants, worlds, w, c, start)
+        _scan(atlas, constants, worlds, w, c)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def respawn_cars(atlas, constants, worlds, clearance):
+    """Put removed cars back on the centreline where they left it, at rest.
+
+    Args:
+        atlas, constants, worlds: see above.
+        clearance: [m] to the middle of every other car, without which a car goes on waiting.
+    """
+    for w in prange(worlds.state.shape[0]):
+        for c in range(worlds.state.shape[1]):
+            if worlds.contact[w, c] == REMOVED:
+                _respawn(atlas, constants, worlds, np.int64(w), c, clearance)

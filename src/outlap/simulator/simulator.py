@@ -12,6 +12,7 @@ from outlap.config import Config
 from outlap.errors import OutlapError
 from outlap.simulator import kernels
 from outlap.simulator.atlas import build_atlas
+from outlap.simulator.collision import REMOVED
 from outlap.simulator.dynamics import DRIFT, EULER, KINEMATIC, RK4, SINGLE_TRACK
 from outlap.simulator.lidar import beam_directions
 from outlap.simulator.state import N_STATE
@@ -179,6 +180,19 @@ class Simulator:
             raise OutlapError(f"world {np.argmin(self._started)} was never reset; call reset before step")
         self._commands[:] = commands
         self._timed(kernels.step_worlds, self.atlas, self._constants, self.worlds, self._commands, repeats)
+
+    def remove(self, cars: np.ndarray) -> None:
+        """Take cars, bool (worlds, cars), off the track: nobody sees or touches them until `respawn` or `reset`."""
+        _check_shape("cars", np.asarray(cars), (self.num_worlds, self.num_cars))
+        self.worlds.contact[cars] = REMOVED
+
+    def respawn(self, clearance: float) -> None:
+        """Put removed cars back on the centreline where they left it, at rest; laps and distance go on.
+
+        Args:
+            clearance: [m] to the middle of every other car, without which a car stays off the track.
+        """
+        self._timed(kernels.respawn_cars, self.atlas, self._constants, self.worlds, float(clearance))
 
     def _timed(self, kernel, *arguments) -> None:
         """Call a kernel; note how long its first call takes, which compiles it or loads it from the cache."""

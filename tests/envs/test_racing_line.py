@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from outlap.envs.rewards import reference_speeds
+from outlap.envs.racing_line import LINE_SPEED, racing_lines
 from outlap.simulator.atlas import FIRST_ROW, LINE_SPACING, ROWS, build_atlas
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds
 from outlap.track.centerline import CURVATURE, Centerline
@@ -22,7 +22,7 @@ GRAVITY = 9.81
 def profile(*tracks: Track, **vehicle: Any) -> list[np.ndarray]:
     """The reference speeds of each track [m/s]."""
     atlas = build_atlas(tracks)
-    speeds = reference_speeds(tracks, atlas, parameter_bounds(VehicleParams(**vehicle))[0])
+    speeds = racing_lines(tracks, atlas, parameter_bounds(VehicleParams(**vehicle))[0])[:, LINE_SPEED]
     assert speeds.shape == (len(atlas.line),)
     return [speeds[first : first + rows] for first, rows in atlas.index[:, [FIRST_ROW, ROWS]]]
 
