@@ -45,7 +45,7 @@ def observations(model) -> dict[str, np.ndarray]:
 
 def space(**changes: Any):
     task = TASK.model_copy(update=changes)
-    return observation_space(task.observation, task.beams, task.lidar.max_range, task.scale_observations)  # type: ignore[arg-type]
+    return observation_space(task.observation, task.beams, task.lidar.max_range, 3, task.scale_observations)  # type: ignore[arg-type]
 
 
 def test_centerline_follower_laps_a_builtin_track():

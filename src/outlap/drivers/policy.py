@@ -34,6 +34,7 @@ class PolicyDriver:
         deterministic: bool = True,
         seed: int = 0,
         name: str = "policy",
+        speeds: tuple[float, float] | None = None,
     ) -> None:
         """Wrap a model.
 
@@ -43,6 +44,8 @@ class PolicyDriver:
             deterministic: take the most likely action; otherwise draw from the policy's distribution.
             seed: of those draws.
             name: in results.
+            speeds: [m/s] that its actions -1 and 1 commanded in training, for a car whose speeds are others; None:
+                those of the car.
 
         Raises OutlapError for a model whose observations or actions are not those of outlap.
         """
@@ -54,6 +57,8 @@ class PolicyDriver:
         self.name = name
         self.observation_terms = tuple(space.spaces)
         self.scale_observations = scale_observations
+        self.speeds = speeds
+        self.beams = _size(space["scan"]) if "scan" in space.spaces else None
         self._space = space
         self._policy: Any = getattr(model, "policy", model)
         self._policy.set_training_mode(False)
@@ -76,6 +81,7 @@ class PolicyDriver:
         deterministic: bool = True,
         seed: int = 0,
         name: str = "policy",
+        speeds: tuple[float, float] | None = None,
     ) -> PolicyDriver:
         """A model of an algorithm, PPO's by default, from the file that Stable-Baselines3 wrote, on the CPU.
 
@@ -98,6 +104,7 @@ class PolicyDriver:
             deterministic=deterministic,
             seed=seed,
             name=name,
+            speeds=speeds,
         )
 
     def check(self, space: gym.Space) -> None:

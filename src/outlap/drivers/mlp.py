@@ -1,0 +1,187 @@
+"""Trained perceptrons as data: policies that are loaded without running code, and many of them asked as one batch."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from outlap.errors import OutlapError
+from outlap.files import atomic_write, to_json
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+
+ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0.0)}
+MOST_WEIGHTS = 1 << 24  # of a file that is loaded: 64 MB
+
+
+@dataclass(frozen=True, eq=False)
+class MLPDriver:
+    """Drives with a perceptron over observation terms, side by side in the order of their names."""
+
+    name: str
+    sizes: Mapping[str, int]  # of each term that it sees
+    scale_observations: bool
+    speeds: tuple[float, float]  # [m/s] that its actions -1 and 1 command
+    activation: str  # between layers; the last is clipped to [-1, 1]
+    weights: tuple[np.ndarray, ...]  # float32 (inputs, outputs) of each layer
+    biases: tuple[np.ndarray, ...]  # float32 (outputs,)
+
+    @property
+    def observation_terms(self) -> tuple[str, ...]:
+        """See `Driver`."""
+        return tuple(sorted(self.sizes))
+
+    @property
+    def beams(self) -> int | None:
+        """Of the scan that it was trained on; None for one that does not look."""
+        return self.sizes.get("scan")
+
+    @property
+    def architecture(self) -> tuple[Any, ...]:
+        """Equal for drivers that can be asked together."""
+        shapes = tuple(weight.shape for weight in self.weights)
+        return tuple(sorted(self.sizes.items())), self.scale_observations, self.activation, shapes
+
+    def begin(self, cars: np.ndarray) -> None:
+        """See `Driver.begin`; it remembers nothing."""
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """See `Driver.act`."""
+        return DriverStack([self]).act(np.zeros(len(observation[self.observation_terms[0]]), np.int64), observation)
+
+    @classmethod
+    def from_ppo(cls, model: PPO, name: str, scale_observations: bool, speeds: tuple[float, float]) -> MLPDriver:
+        """The mean action of a Stable-Baselines3 PPO policy with a Dict observation and no shared layers."""
+        import torch
+
+        policy = model.policy
+        layers = [*policy.mlp_extractor.policy_net, policy.action_net]
+        linear = [layer for layer in layers if isinstance(layer, torch.nn.Linear)]
+        between = {type(layer) for layer in layers if not isinstance(layer, torch.nn.Linear)}
+        names = {torch.nn.Tanh: "tanh", torch.nn.ReLU: "relu"}
+        if len(between) != 1 or not between <= set(names):
+            raise OutlapError(f"{name}: has layers {sorted(kind.__name__ for kind in between)}; must be Tanh or ReLU")
+        sizes = {term: int(box.shape[0]) for term, box in model.observation_space.spaces.items()}  # type: ignore[attr-defined]
+        return cls(
+            name, sizes, scale_observations, speeds, names[between.pop()],
+            tuple(layer.weight.detach().cpu().numpy().T.copy() for layer in linear),
+            tuple(layer.bias.detach().cpu().numpy().copy() for layer in linear),
+        )  # fmt: skip
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write PATH.safetensors with the weights and PATH.json with all else."""
+        from safetensors.numpy import save
+
+        path = Path(path)
+        tensors = {f"weight_{i}": np.ascontiguousarray(weight) for i, weight in enumerate(self.weights)}
+        tensors |= {f"bias_{i}": bias for i, bias in enumerate(self.biases)}
+        facts = {
+            "name": self.name,
+            "sizes": dict(self.sizes),
+            "scale_observations": self.scale_observations,
+            "speeds": list(self.speeds),
+            "activation": self.activation,
+            "layers": len(self.weights),
+        }
+        atomic_write(path.with_name(f"{path.name}.safetensors"), save(tensors))
+        atomic_write(path.with_name(f"{path.name}.json"), to_json(facts))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> MLPDriver:
+        """Read what `save` wrote; runs no code from the files.
+
+        Raises OutlapError for files that are missing, broken, or of layers that do not fit together.
+        """
+        from safetensors import SafetensorError
+        from safetensors.numpy import load
+
+        path = Path(path)
+        try:
+            facts = json.loads(path.with_name(f"{path.name}.json").read_text(encoding="utf-8"))
+            content = path.with_name(f"{path.name}.safetensors").read_bytes()
+            if len(content) > 4 * MOST_WEIGHTS:
+                raise OutlapError(f"{path}: holds {len(content)} bytes of weights; must be at most {4 * MOST_WEIGHTS}")
+            tensors = load(content)
+            layers = range(int(facts["layers"]))
+            driver = cls(
+                str(facts["name"]),
+                {str(term): int(size) for term, size in facts["sizes"].items()},
+                bool(facts["scale_observations"]),
+                (float(facts["speeds"][0]), float(facts["speeds"][1])),
+                str(facts["activation"]),
+                tuple(tensors[f"weight_{i}"].astype(np.float32) for i in layers),
+                tuple(tensors[f"bias_{i}"].astype(np.float32) for i in layers),
+            )
+        except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, SafetensorError) as error:
+            raise OutlapError(f"{path}: cannot be read as a driver: {error}") from None
+        driver._check(path)
+        return driver
+
+    def _check(self, path: Path) -> None:
+        if self.activation not in ACTIVATIONS:
+            raise OutlapError(f"{path}: activation is {self.activation!r}; must be one of {', '.join(ACTIVATIONS)}")
+        slowest, fastest = self.speeds
+        if not -math.inf < slowest < fastest < math.inf:
+            raise OutlapError(f"{path}: speeds are {slowest}, {fastest}; must be the slowest and the fastest [m/s]")
+        width = sum(self.sizes.values())
+        for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            outputs = bias.shape[0] if bias.ndim == 1 else -1
+            if weight.shape != (width, outputs):
+                raise OutlapError(f"{path}: layer {number} has weights {weight.shape}; must be ({width}, {outputs})")
+            if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+                raise OutlapError(f"{path}: layer {number} holds numbers that are not finite")
+            width = outputs
+        if width != 2:
+            raise OutlapError(f"{path}: gives {width} numbers; must be 2, steer and speed")
+
+
+class DriverStack:
+    """Perceptrons of one architecture, asked as one batch of matrix products."""
+
+    def __init__(self, drivers: Sequence[MLPDriver]) -> None:
+        """Stack them. Raises OutlapError where their architectures differ."""
+        first = drivers[0]
+        for driver in drivers:
+            if driver.architecture != first.architecture:
+                raise OutlapError(f"{driver.name}: has another architecture than {first.name}; ask them one by one")
+        self.observation_terms, self.scale_observations = first.observation_terms, first.scale_observations
+        self.beams = first.beams
+        self._drivers = drivers
+        self._activation = ACTIVATIONS[first.activation]
+        depth = range(len(first.weights))
+        self._weights = [np.stack([driver.weights[i] for driver in drivers]) for i in depth]
+        self._biases = [np.stack([driver.biases[i] for driver in drivers])[:, None] for i in depth]
+
+    def act(self, which: np.ndarray, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Actions (n, 2) of cars that are driven by the drivers of these numbers, int (n,).
+
+        Raises OutlapError for an observation of another shape than the drivers were trained on.
+        """
+        for term, size in self._drivers[0].sizes.items():
+            found = observation[term].shape
+            if found != (len(which), size):
+                raise OutlapError(
+                    f"{self._drivers[0].name}: observation {term!r} has shape {found}; must be {(len(which), size)}"
+                )
+        seen = np.concatenate([observation[term] for term in self.observation_terms], axis=1)
+        counts = np.bincount(which, minlength=len(self._drivers))
+        order = np.argsort(which, kind="stable")
+        place = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        at = which[order], place
+        x = np.zeros((len(counts), counts.max(initial=0), seen.shape[1]), np.float32)
+        x[at] = seen[order]
+        for number, (weight, bias) in enumerate(zip(self._weights, self._biases, strict=True)):
+            x = x @ weight + bias
+            if number < len(self._weights) - 1:
+                x = self._activation(x)
+        actions = np.empty((len(which), 2), np.float32)
+        actions[order] = np.clip(x[at], -1.0, 1.0)
+        return actions
