@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from outlap.envs.actions import commands
+from outlap.envs.actions import commands, speed_spans
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds
 
@@ -21,14 +21,17 @@ def row(**changes: Any) -> np.ndarray:
     [(-1.0, -0.2), (-0.5, -0.1), (0.0, 0.0), (0.5, 0.2), (1.0, 0.4)],
 )
 def test_the_stops_of_an_asymmetrical_steering_are_at_plus_and_minus_one(steer, angle):
-    command = commands(np.array([steer, 0.0]), row(steer_min=-0.2, steer_max=0.4), None)
+    command = commands(np.array([steer, 0.0]), row(steer_min=-0.2, steer_max=0.4), np.array([0.0, 1.0]))
     assert command[0] == pytest.approx(angle, abs=1e-7)
 
 
-@pytest.mark.parametrize(("speed_range", "low", "high"), [(None, -5.0, 20.0), ((1.0, 7.0), 1.0, 7.0)])
+@pytest.mark.parametrize(
+    ("speed_range", "low", "high"), [(None, -5.0, 20.0), ((1.0, 7.0), 1.0, 7.0), ((1.0, None), 1.0, 20.0)]
+)
 def test_the_second_number_spans_the_speed_range_or_the_cars_own(speed_range, low, high):
     actions = np.array([[0.0, -1.0], [0.0, 0.0], [0.0, 0.5], [0.0, 1.0]])
-    command = commands(actions, np.tile(row(), (4, 1)), speed_range)
+    params = np.tile(row(), (4, 1))
+    command = commands(actions, params, speed_spans(params, speed_range))
     expected = [low, (low + high) / 2, low + 0.75 * (high - low), high]
     np.testing.assert_allclose(command[:, 1], expected, rtol=1e-6)
     np.testing.assert_array_equal(command[:, 0], 0.0)
@@ -36,7 +39,8 @@ def test_the_second_number_spans_the_speed_range_or_the_cars_own(speed_range, lo
 
 def test_every_car_has_its_own_limits():
     params = np.stack([row(steer_max=0.3, v_min=-1.0, v_max=5.0), row(steer_max=0.5, v_min=0.0, v_max=9.0)])
-    command = commands(np.ones((3, 2, 2)), np.broadcast_to(params, (3, 2, params.shape[1])), None)
+    params = np.broadcast_to(params, (3, 2, params.shape[1]))
+    command = commands(np.ones((3, 2, 2)), params, speed_spans(params, None))
     np.testing.assert_allclose(command, np.broadcast_to([[0.3, 5.0], [0.5, 9.0]], (3, 2, 2)), rtol=1e-6)
     assert command.dtype == np.float32
 

@@ -8,10 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from outlap.envs.observations import CURVATURE_AHEAD, OBSERVATION_TERMS
+from outlap.envs.observations import CURVATURE_AHEAD, LINE_AHEAD, OBSERVATION_TERMS
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 from outlap.simulator.lidar import beam_directions
+from outlap.simulator.vehicle import STEER_MAX, V_MAX, V_MIN
 
 ALL = tuple(OBSERVATION_TERMS)
 
@@ -74,6 +75,27 @@ def test_the_previous_action_is_the_one_just_carried_out_and_zero_after_a_reset(
     fresh, _ = env.reset(options={"reset_mask": np.arange(8) < 3})
     np.testing.assert_array_equal(fresh["previous_action"][:3], 0.0)
     np.testing.assert_array_equal(fresh["previous_action"][3:], action[3:])
+
+
+def test_the_line_ahead_is_the_centreline_where_there_is_no_raceline(driven, ellipse):
+    _, observation, _ = driven
+    x, y, yaw = observation["pose"].astype(np.float64).T
+    s, _ = ellipse.centerline.to_frenet(x, y)
+    points = ellipse.centerline.position(s[:, None] + np.array(LINE_AHEAD))
+    along = np.exp(-1j * yaw)[:, None] * (points[..., 0] - x[:, None] + 1j * (points[..., 1] - y[:, None]))
+    seen = observation["line_ahead"].reshape(8, len(LINE_AHEAD), 3)
+    np.testing.assert_allclose(seen[..., 0], along.real, atol=0.06)  # the table's spacing is 0.1 m
+    np.testing.assert_allclose(seen[..., 1], along.imag, atol=0.06)
+    assert (seen[..., 2] > 1.0).all()
+
+
+def test_the_action_span_is_what_the_extremes_command(driven):
+    env, observation, _ = driven
+    params = env.race.worlds.params[:, 0]
+    lock, slowest, fastest = observation["action_span"].T
+    np.testing.assert_array_equal(lock, params[:, STEER_MAX])
+    np.testing.assert_array_equal(slowest, params[:, V_MIN])
+    np.testing.assert_array_equal(fastest, params[:, V_MAX])
 
 
 def test_frenet_agrees_with_the_projection_on_the_spline(driven, ellipse):
@@ -174,6 +196,8 @@ def test_scaling_divides_by_the_declared_constants(ellipse):
     scales = {
         "scan": 10.0, "pose": [50.0, 50.0, math.pi], "vel": [10.0, 2.0, 5.0], "heading": 0.4, "previous_action": 1.0,
         "previous_reward": 0.1, "frenet": 1.0, "curvature_ahead": 0.5,
+        "line_ahead": [5.0, 5.0, 10.0] * len(LINE_AHEAD), "action_span": [0.4, 10.0, 10.0],
+        "nearby_cars": [1.0, 5.0, 5.0, 1.0, 5.0] * 3,
     }  # fmt: skip
     assert set(scales) == set(ALL)
     for name, scale in scales.items():
@@ -215,7 +239,7 @@ def test_the_ego_sees_only_its_own_car(ellipse, put):
         for _ in range(20):
             action = np.tile([0.2, -0.4], (3, 1))
             alone, together = one.step(action)[0], two.step(action)[0]
-        for name in set(ALL) - {"scan"}:
+        for name in set(ALL) - {"scan", "nearby_cars"}:
             np.testing.assert_array_equal(alone[name], together[name])
         shorter = together["scan"] < alone["scan"] - 0.1
         angles = np.linspace(-2.35, 2.35, 61)
@@ -232,3 +256,22 @@ def test_beams_cover_the_field_of_view_evenly():
     cos, sin = beam_directions(1080, 4.7)
     angles = np.arctan2(np.asarray(sin, np.float64), np.asarray(cos, np.float64))[:1080]
     np.testing.assert_allclose(angles, np.linspace(-2.35, 2.35, 1080), atol=1e-6)
+
+
+def test_as_many_nearby_cars_are_told_of_as_configured(big_circle, put):
+    """The nearest of three, alone, and all three with a block of zeros behind them."""
+    starts = np.array([[10.0, 0.0, 0.0, 2.0], [14.0, 0.3, 0.0, 1.0], [7.0, 0.0, 0.1, 0.0], [20.0, 0.0, 0.0, 0.0]])
+    told = {}
+    for count in (1, 4):
+        env = RaceVectorEnv(
+            1, tracks=[big_circle], num_cars=4, beams=0, nearby_cars=count, observation=("nearby_cars",)
+        )
+        put(env, starts)
+        told[count] = env.observe(0)["nearby_cars"][0].reshape(count, 5)
+        assert env.single_observation_space["nearby_cars"].shape == (5 * count,)  # type: ignore[index]
+    np.testing.assert_array_equal(told[4][0], told[1][0])
+    assert told[1][0][1] < 0.0, "the one behind is the nearest"
+    assert told[4][:3, 0].tolist() == [1.0, 1.0, 1.0]
+    np.testing.assert_allclose(told[4][:3, 4], [-2.0, -1.0, -2.0], atol=1e-6)
+    np.testing.assert_array_equal(told[4][3], 0.0)
+    assert (np.diff(np.hypot(*told[4][:3, 1:3].T)) > 0.0).all()

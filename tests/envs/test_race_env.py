@@ -17,11 +17,15 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorSta
 from outlap.drivers.centerline_follower import CenterlineFollower
 from outlap.envs.race_env import RaceEnv
 from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
+from outlap.envs.racing_line import LINE_SPEED
 from outlap.errors import OutlapError
 from outlap.simulator.atlas import FIRST_ROW, ROWS
 
 NAME = "outlap/Race-v0"
-EVERYTHING = ("scan", "pose", "vel", "heading", "previous_action", "previous_reward", "frenet", "curvature_ahead")
+EVERYTHING = (
+    "scan", "pose", "vel", "heading", "previous_action", "previous_reward", "frenet", "curvature_ahead", "line_ahead",
+    "action_span",
+)  # fmt: skip
 
 
 def test_importing_outlap_registers_the_environment():
@@ -240,7 +244,7 @@ def test_real_circuits_by_name(real_tracks, monkeypatch):
     race = env.unwrapped.race  # type: ignore[attr-defined]
     track = race.simulator.tracks[1]
     first, rows = race.simulator.atlas.index[1, [FIRST_ROW, ROWS]]
-    speeds = race.reference_speed[first : first + rows]
+    speeds = race.racing_line[first : first + rows, LINE_SPEED]
     slowest = np.argmin(track.raceline.speed)
     assert speeds.min() == pytest.approx(track.raceline.speed[slowest], abs=0.05)
     s, _ = track.centerline.to_frenet(track.raceline.x[slowest], track.raceline.y[slowest])

@@ -11,19 +11,20 @@ from scipy import stats
 
 from outlap.evaluation.metrics import summarise
 
-# track, outcome, overtakes, places lost, laps, lap time, speed, progress, steps, return
+# track, outcome, contact, opponents' crashes, overtakes, places lost, laps, lap time, speed, progress, steps, return
 ROWS = [
-    ("A", "crash", 2, 1, 0, math.nan, 5.0, 10.0, 50, -1.0),
-    ("A", "finished", 1, 0, 3, 60.0, 7.0, 1200.0, 4500, 9.0),
-    ("A", "timeout", 0, 0, 1, 80.0, 6.0, 700.0, 6000, 4.0),
-    ("B", "stalled", 0, 4, 0, math.nan, 0.0, 0.0, 75, 0.0),
+    ("A", "crash", "car", 1, 2, 1, 0, math.nan, 5.0, 10.0, 50, -1.0),
+    ("A", "finished", "", 0, 1, 0, 3, 60.0, 7.0, 1200.0, 4500, 9.0),
+    ("A", "timeout", "", 2, 0, 0, 1, 80.0, 6.0, 700.0, 6000, 4.0),
+    ("B", "stalled", "", 0, 0, 4, 0, math.nan, 0.0, 0.0, 75, 0.0),
 ]
 NAMES = [
-    "track", "outcome", "overtakes", "places_lost", "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m",
-    "episode_steps", "episode_return",
+    "track", "outcome", "contact", "opponent_crashes", "overtakes", "places_lost", "completed_laps", "lap_time_s",
+    "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
 ]  # fmt: skip
 KEYS = {
     "episodes", "crash_rate", "crash_rate_low", "crash_rate_high", "overtakes", "places_lost", "outcomes",
+    "contacts", "opponent_crashes",
     "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
 }  # fmt: skip
 
@@ -38,7 +39,7 @@ def test_every_summary_has_exactly_the_promised_keys(summary):
     assert list(summary["tracks"]) == ["A", "B"]
     for each in (summary["all"], *summary["tracks"].values()):
         assert set(each) == KEYS
-        for name in NAMES[4:]:
+        for name in NAMES[6:]:
             assert set(each[name]) == {"mean", "sd", "low", "high"}
 
 
@@ -47,6 +48,8 @@ def test_counts_are_counts_and_totals_are_totals(summary):
     assert (a["episodes"], a["overtakes"], a["places_lost"]) == (3, 3, 1)
     assert a["outcomes"] == {"crash": 1, "finished": 1, "timeout": 1, "stalled": 0}
     assert summary["all"]["places_lost"] == 5
+    assert summary["all"]["contacts"] == {"wall": 0, "car": 1}
+    assert (a["opponent_crashes"], summary["tracks"]["B"]["opponent_crashes"]) == (3, 0)
 
 
 def test_crash_rate_counts_crashes_only(summary):

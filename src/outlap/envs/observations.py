@@ -9,16 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
 
 import gymnasium as gym
 import numpy as np
 
-from outlap.envs.race import EGO, Race
+from outlap.envs.race import Race
+from outlap.envs.racing_line import LINE_SPEED, LINE_X, LINE_Y
 from outlap.simulator import state as column
+from outlap.simulator.collision import REMOVED
 from outlap.simulator.kernels import HEADING_ERROR, OFFSET
+from outlap.simulator.vehicle import STEER_MAX
 from outlap.track.centerline import CURVATURE
 
 INF = math.inf
+LINE_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)  # [m] along the centreline
 CURVATURE_AHEAD = (1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.5, 15.0, 20.0, 25.0)  # [m] ahead of the car
 
 
@@ -27,10 +33,11 @@ class ObservationTerm:
     """A named part of the observation."""
 
     read: Callable[[Race, int], np.ndarray]  # (race, car) → (worlds, size), a new array or a view
-    low: tuple[float, ...]  # one a number, or one for all
+    low: tuple[float, ...]  # one a number of a block, or one for all
     high: tuple[float, ...]
     scale: tuple[float, ...]
-    size: int | None = None  # None: as many numbers as beams
+    size: int = 1  # numbers of a block
+    blocks: int | Literal["beams", "nearby_cars"] = 1  # or as many as the configuration has
 
 
 def scan(race: Race, car: int) -> np.ndarray:
@@ -61,8 +68,8 @@ def previous_action(race: Race, car: int) -> np.ndarray:
 
 
 def previous_reward(race: Race, car: int) -> np.ndarray:
-    """The ego's reward of the step before; 0 after a reset. No reward is counted for other cars: 0."""
-    return race.rewards[:, None] if car == EGO else np.zeros_like(race.rewards)[:, None]
+    """The car's reward of the step before; 0 after a reset, and for opponents, whose rewards nobody counts."""
+    return race.rewards[:, car, None]
 
 
 def frenet(race: Race, car: int) -> np.ndarray:
@@ -75,8 +82,50 @@ def curvature_ahead(race: Race, car: int) -> np.ndarray:
     return race.line_values(car, CURVATURE, np.array(CURVATURE_AHEAD))
 
 
+def line_ahead(race: Race, car: int) -> np.ndarray:
+    """The racing line at LINE_AHEAD: x, y [m] in the car's frame and speed [m/s] of each point. Needs the map."""
+    state = race.worlds.state[:, car]
+    points = race.racing_line[race.line_rows(car, np.array(LINE_AHEAD))]
+    dx = points[..., LINE_X] - state[:, column.X, None]
+    dy = points[..., LINE_Y] - state[:, column.Y, None]
+    cos, sin = np.cos(state[:, column.YAW, None]), np.sin(state[:, column.YAW, None])
+    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx, points[..., LINE_SPEED]], -1).reshape(len(state), -1)
+
+
+def action_span(race: Race, car: int) -> np.ndarray:
+    """What actions mean: steering angle at full lock [rad], speeds that -1 and 1 command [m/s]."""
+    lock = race.worlds.params[:, car, STEER_MAX]
+    return np.column_stack([lock, race.speeds[:, car]])
+
+
+def nearby_cars(race: Race, car: int) -> np.ndarray:
+    """The nearest cars, nearest first, zeros where there are fewer; how many: `RaceConfig.nearby_cars`.
+
+    Of each: 1, x and y [m] and heading [rad] in the car's frame, its speed less the car's own [m/s].
+    """
+    state = race.worlds.state
+    own = state[:, car, None]
+    dx, dy = state[..., column.X] - own[..., column.X], state[..., column.Y] - own[..., column.Y]
+    cos, sin = np.cos(own[..., column.YAW]), np.sin(own[..., column.YAW])
+    turn = state[..., column.YAW] - own[..., column.YAW]
+    told = np.stack(
+        [
+            np.ones_like(dx), cos * dx + sin * dy, cos * dy - sin * dx, np.arctan2(np.sin(turn), np.cos(turn)),
+            state[..., column.SPEED] - own[..., column.SPEED],
+        ],
+        axis=-1,
+    )  # fmt: skip
+    away = np.where(race.worlds.contact == REMOVED, np.inf, np.hypot(dx, dy))
+    away[:, car] = np.inf
+    nearest = np.argsort(away, axis=1, kind="stable")[:, : min(race.nearby_cars, state.shape[1] - 1)]
+    there = np.isfinite(np.take_along_axis(away, nearest, axis=1))
+    out = np.zeros((len(state), race.nearby_cars, told.shape[-1]), np.float32)
+    out[:, : nearest.shape[1]] = np.take_along_axis(told, nearest[..., None], axis=1) * there[..., None]
+    return out.reshape(len(state), -1)
+
+
 OBSERVATION_TERMS: dict[str, ObservationTerm] = {
-    "scan": ObservationTerm(scan, low=(0.0,), high=(INF,), scale=(10.0,)),
+    "scan": ObservationTerm(scan, low=(0.0,), high=(INF,), scale=(10.0,), blocks="beams"),
     "pose": ObservationTerm(
         pose, low=(-INF, -INF, -math.pi), high=(INF, INF, math.pi), scale=(50.0, 50.0, math.pi), size=3
     ),
@@ -88,31 +137,53 @@ OBSERVATION_TERMS: dict[str, ObservationTerm] = {
     "curvature_ahead": ObservationTerm(
         curvature_ahead, low=(-INF,), high=(INF,), scale=(0.5,), size=len(CURVATURE_AHEAD)
     ),
+    "line_ahead": ObservationTerm(
+        line_ahead, low=(-INF,), high=(INF,), scale=(5.0, 5.0, 10.0), size=3, blocks=len(LINE_AHEAD)
+    ),
+    "nearby_cars": ObservationTerm(
+        nearby_cars,
+        low=(0.0, -INF, -INF, -math.pi, -INF),
+        high=(1.0, INF, INF, math.pi, INF),
+        scale=(1.0, 5.0, 5.0, 1.0, 5.0),
+        size=5,
+        blocks="nearby_cars",
+    ),
+    "action_span": ObservationTerm(action_span, low=(-INF,), high=(INF,), scale=(0.4, 10.0, 10.0), size=3),
 }
 
 
-def observation_space(terms: Sequence[str], beams: int, max_range: float, scaled: bool) -> gym.spaces.Dict:
+def observation_space(
+    terms: Sequence[str], beams: int, max_range: float, nearby_cars: int, scaled: bool
+) -> gym.spaces.Dict:
     """The space of one car's observation.
 
     Args:
         terms: names of OBSERVATION_TERMS.
         beams: of the scanner; without any, `scan` is an empty array.
         max_range: largest that a scanner can have [m].
+        nearby_cars: of which the term `nearby_cars` tells.
         scaled: whether terms are divided by their scale.
     """
     spaces: dict[str, gym.Space] = {}
     for name in terms:
         term = OBSERVATION_TERMS[name]
-        shape = (beams if term.size is None else term.size,)
-        low, high, scale = (
-            np.broadcast_to(np.asarray(ends, np.float32), shape) for ends in (term.low, term.high, term.scale)
-        )
+        blocks = {"beams": beams, "nearby_cars": nearby_cars}.get(term.blocks, term.blocks)  # type: ignore[arg-type]
+        shape = (term.size * int(blocks),)
+        low, high, scale = (_repeated(ends, term.size, shape[0]) for ends in (term.low, term.high, term.scale))
         if name == "scan":
             high = np.full(shape, max_range, np.float32)
         if scaled:
             low, high = low / scale, high / scale
         spaces[name] = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), shape, np.float32)
     return gym.spaces.Dict(spaces)
+
+
+@lru_cache
+def _repeated(block: tuple[float, ...], size: int, count: int) -> np.ndarray:
+    """A term's constants, given for a block of numbers or for all, for all of its numbers: float32 (count,)."""
+    constants = np.tile(np.broadcast_to(np.asarray(block, np.float32), (size,)), count // size)
+    constants.flags.writeable = False  # all that ask for it share it
+    return constants
 
 
 def observe(race: Race, car: int, terms: Sequence[str], scaled: bool) -> dict[str, np.ndarray]:
@@ -123,7 +194,8 @@ def observe(race: Race, car: int, terms: Sequence[str], scaled: bool) -> dict[st
         value = term.read(race, car)
         if scaled:
             # Divided as the space's bounds are: times the reciprocal could round to just outside of them.
-            observation[name] = np.divide(value, np.asarray(term.scale, np.float32), dtype=np.float32)
+            scale = _repeated(term.scale, term.size, value.shape[1])
+            observation[name] = np.divide(value, scale, dtype=np.float32)
         else:
             observation[name] = np.array(value, dtype=np.float32)
     return observation

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from outlap.config import Config, Number, bounded
+from outlap.config import Number, bounded
 from outlap.envs.rewards import RewardConfig
+from outlap.envs.starts import StartConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.simulator.simulator import SimulatorConfig
 from outlap.simulator.vehicle import PRESETS, ActuatorParams, LidarParams, VehicleParams
 
 PAPER_OBSERVATION = ("scan", "pose", "vel", "heading")
-
-
-class StartConfig(Config):
-    """Where and how cars are put on the track."""
-
-    anywhere: bool = True  # at a random arc length; otherwise the ego is put on the start line
-    speed: Number = 0.0  # of every car [m/s]
-    offset: float = Field(default=0.5, ge=0, le=1)  # largest, as a share of the room to the track's edge
-    heading_error: float = Field(default=0.1, ge=0)  # largest [rad]
-    gap: Annotated[Number, bounded(at_least=0)] = (1.5, 4.0)  # between one car and the next along the track [m]
 
 
 def _vehicle_preset(value: Any) -> Any:
@@ -44,19 +35,25 @@ class RaceConfig(SimulatorConfig):
     tracks: tuple[str, ...] = ()  # names or paths, one drawn at each reset; none: the built-in training set
     augment_tracks: bool = False  # race each track also the other way round, mirrored, and both
     num_cars: int = Field(default=1, ge=1, le=64)  # the ego and its opponents
-    opponent_speed: Annotated[Number, bounded(at_least=0)] = 3.0  # their top speed, drawn per opponent [m/s]
+    opponents: tuple[str, ...] = ("pure-pursuit",)  # see drivers.find; one driver is drawn per opponent and reset
+    opponent_split: Literal["train", "held_out"] = "train"  # the half of a population; training takes no other
+    opponent_code: bool = False  # whether opponents may run code when loaded: zips of runs, module:function
+    opponent_crash: Literal["park", "remove", "respawn"] = "park"  # what becomes of an opponent that crashed
+    opponent_speed: Annotated[Number, bounded(at_least=0)] | None = None  # their cars' top speed [m/s], drawn likewise
+    opponent_noise: Annotated[Number, bounded(at_least=0)] = 0.0  # standard deviation of their actions, likewise
     control_interval: int = Field(default=1, ge=1, le=100)  # physics steps per action
     speed_range: tuple[float, float | None] | None = None  # [m/s] commanded by -1, 1; None: v_min, v_max
     vehicle: Annotated[VehicleParams, BeforeValidator(_vehicle_preset)] = VehicleParams()
     actuators: ActuatorParams = ActuatorParams()
     lidar: LidarParams = LidarParams()
     observation: tuple[str, ...] = PAPER_OBSERVATION  # terms, see envs.observations
+    nearby_cars: int = Field(default=3, ge=1)  # of which the term of that name tells
     scale_observations: bool = False  # divide every term by its declared scale
     reward: RewardConfig = RewardConfig()
     termination: TerminationConfig = TerminationConfig()
     start: StartConfig = StartConfig()
 
-    @field_validator("tracks", "observation", mode="before")
+    @field_validator("tracks", "observation", "opponents", mode="before")
     @classmethod
     def _one_name_is_a_list(cls, value: Any) -> Any:
         return (value,) if isinstance(value, str) else value

@@ -12,29 +12,31 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from outlap.config import bounds, validate
-from outlap.drivers.centerline_follower import CenterlineFollower
-from outlap.envs.actions import commands
+from outlap.drivers.find import Named, driver_name, find_drivers
+from outlap.envs.actions import commands, speed_spans
 from outlap.envs.observations import observation_space, observe
+from outlap.envs.opponents import Opponents
 from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.rewards import REWARD_TERMS, reference_speeds
+from outlap.envs.racing_line import racing_lines
+from outlap.envs.rewards import REWARD_TERMS
+from outlap.envs.starts import draw_starts
 from outlap.envs.tasks import TaskSet, load_tracks, track_name
 from outlap.envs.terminations import RUNNING, STALLED, outcomes
 from outlap.errors import OutlapError
-from outlap.seeding import DRIVER_STREAM, START_STREAM, uniform, world_keys
-from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
-from outlap.simulator.collision import FREE
+from outlap.seeding import world_keys
+from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL
 from outlap.simulator.simulator import Simulator
-from outlap.simulator.vehicle import LENGTH, V_MAX, V_MIN, WIDTH, parameter_bounds
-from outlap.track.centerline import WIDTH_LEFT, WIDTH_RIGHT
+from outlap.simulator.vehicle import parameter_bounds
 from outlap.track.track import Track
 
-START_MARGIN = 0.1  # [m] that a start leaves between the car and the track's edge
 START_ATTEMPTS = 20
+RESPAWN_CLEARANCE = 3.0  # [m] to the middle of every other car, before an opponent comes back
+CONTACTS = np.array(["", "wall", "car", ""], dtype=object)  # what was hit, by FREE, HIT_WALL, HIT_CAR, REMOVED
 OFFERED_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 EPISODE_FIELDS = (
     "episode_return", "episode_steps", "progress_m", "mean_speed_mps", "completed_laps", "lap_time_s",
-    "overtakes", "places_lost", "impact_speed_mps",
+    "overtakes", "places_lost", "impact_speed_mps", "opponent_crashes",
 )  # fmt: skip
 
 
@@ -53,6 +55,7 @@ class RaceVectorEnv(VectorEnv):
         num_envs: int = 1,
         *,
         tracks: Sequence[str | os.PathLike[str] | Track] | str | os.PathLike[str] | Track = (),
+        opponents: Sequence[Named] | Named | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: None = None,
         **config: Any,
@@ -63,18 +66,25 @@ class RaceVectorEnv(VectorEnv):
             num_envs: worlds.
             tracks: names, map folders or `Track`s, one of which is drawn at each reset; none of them gives the
                 built-in training set.
+            opponents: names (see `drivers.find`), `Driver`s or functions, one of which is drawn for each opponent at
+                each reset; by default pure pursuit.
             autoreset_mode: SAME_STEP, or DISABLED for a caller that resets by `reset_mask`.
             render_mode: only None; races are looked at through `outlap`'s viewers.
             **config: the fields of `RaceConfig`.
 
-        Raises OutlapError for an unknown or wrong field, a track that cannot be loaded.
+        Raises OutlapError for an unknown or wrong field, a track or an opponent that cannot be loaded.
         """
-        names = list(tracks) if isinstance(tracks, Sequence) and not isinstance(tracks, str) else [tracks]
+        names: list[Any] = list(tracks) if isinstance(tracks, Sequence) and not isinstance(tracks, str) else [tracks]
         if not names:
             from outlap.track.generate import BUILTIN_TRAIN
 
             names = list(BUILTIN_TRAIN)
-        self.config = validate(RaceConfig, {**config, "tracks": tuple(map(track_name, names))}, "outlap/Race-v0")
+        config["tracks"] = tuple(map(track_name, names))
+        rivals: Sequence[Named] | None = None
+        if opponents is not None:
+            rivals = opponents if isinstance(opponents, (list, tuple)) else [opponents]  # type: ignore[list-item]
+            config["opponents"] = tuple(driver_name(rival) for rival in rivals)  # type: ignore[union-attr]
+        self.config = validate(RaceConfig, config, "outlap/Race-v0")
         if autoreset_mode not in (*OFFERED_MODES, *(mode.value for mode in OFFERED_MODES)):
             raise OutlapError(f"autoreset_mode is {autoreset_mode!r}; SAME_STEP and DISABLED are offered")
         loaded = load_tracks(names, self.config.augment_tracks)
@@ -89,24 +99,25 @@ class RaceVectorEnv(VectorEnv):
         self.tasks = TaskSet(loaded, self.config.vehicle, self.config.actuators, self.config.lidar)
         simulator = Simulator(loaded, num_envs, self.config.num_cars, self.config, self.tasks.max_delay)
         typical = np.mean(parameter_bounds(self.config.vehicle), axis=0)
-        self.race = Race(simulator, reference_speeds(loaded, simulator.atlas, typical))
+        self.race = Race(simulator, self.config.nearby_cars, racing_lines(loaded, simulator.atlas, typical))
         self._weights = self.config.reward.resolved()
         interval = self.config.control_interval * self.config.timestep
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": [], "render_fps": round(1 / interval)}
 
         self.single_observation_space = observation_space(
             self.config.observation, self.config.beams, bounds(self.config.lidar.max_range)[1],
-            self.config.scale_observations,
+            self.config.nearby_cars, self.config.scale_observations,
         )  # fmt: skip
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        self._opponents = CenterlineFollower(speed_action=1.0)
-        self._opponent_speed = np.zeros((num_envs, self.config.num_cars), np.float32)
+        self._opponents = self._find_opponents(self.config.opponents if rivals is None else rivals)
         self._keys: np.ndarray | None = None
         self._episode = np.zeros(num_envs, np.int64)  # number of each world's episode since it was seeded
         self._over = np.ones(num_envs, bool)  # waits for a reset
+        self._task = np.full(num_envs, "", object)  # name of each world's
+        self._down = np.zeros((num_envs, self.config.num_cars - 1), bool)  # opponents that have crashed
         self._names = np.array([track.name for track in loaded], dtype=object)
         self._totals = {name: np.zeros(num_envs) for name in (*EPISODE_FIELDS, *self._weights)}
 
@@ -134,7 +145,7 @@ class RaceVectorEnv(VectorEnv):
         which = np.flatnonzero(mask)
         self._seed(seed, which)
         self._begin(which)
-        return self._observe(), self._info()
+        return self.observe(EGO), self._info()
 
     def step(
         self, actions: np.ndarray
@@ -143,20 +154,10 @@ class RaceVectorEnv(VectorEnv):
 
         Raises OutlapError for actions of a wrong shape, not finite, or before a reset.
         """
-        race, config = self.race, self.config
-        race.act(self._all_actions(actions))
-        limits = race.worlds.params
-        command = commands(race.actions, limits, config.speed_range)
-        if config.num_cars > 1:
-            command[:, 1:, 1] = 0.5 * (race.actions[:, 1:, 1] + 1.0) * self._opponent_speed[:, 1:]
-        race.simulator.step(command, config.control_interval)
-        race.advance(config.termination.stall_distance)
-        race.training_steps += self.num_envs
-
-        outcome = outcomes(race, config.termination)
-        race.stalled[:] = outcome == STALLED
-        rewards = self._reward()
-        terminated = race.crashed.copy()
+        self.advance(self._all_actions(actions))
+        outcome = self.outcomes(EGO)
+        rewards = self.rewards(EGO, self._totals)
+        terminated = self.race.crashed[:, EGO].copy()
         truncated = ~terminated & (outcome != RUNNING)
         self._count(rewards)
 
@@ -164,11 +165,11 @@ class RaceVectorEnv(VectorEnv):
         over = terminated | truncated
         self._over = over.copy()  # which the next reset changes
         if over.any() and self.autoreset_mode == AutoresetMode.SAME_STEP:
-            final = self._observe()
+            final = self.observe(EGO)
             final_info = {name: value.copy() for name, value in info.items() if not name.startswith("_")}
             which = np.flatnonzero(over)
             self._begin(which)
-            observation = self._observe()
+            observation = self.observe(EGO)
             final_obs = np.full(self.num_envs, None, dtype=object)
             for world in which:
                 final_obs[world] = {name: value[world] for name, value in final.items()}
@@ -177,7 +178,45 @@ class RaceVectorEnv(VectorEnv):
             info["final_info"] = {**final_info, **{f"_{name}": over & known[f"_{name}"] for name in final_info}}
             info["_final_info"] = over
             return observation, rewards, terminated, truncated, info
-        return self._observe(), rewards, terminated, truncated, info
+        return self.observe(EGO), rewards, terminated, truncated, info
+
+    def advance(self, actions: np.ndarray) -> None:
+        """Carry out an action (worlds, cars, 2) of every car: a step, of which the methods below then tell.
+
+        Raises OutlapError before a reset.
+        """
+        if self._over.any():
+            raise OutlapError(f"world {np.argmax(self._over)}: its episode is over or never began; call reset first")
+        race, config = self.race, self.config
+        race.act(actions)
+        race.simulator.step(commands(race.actions, race.worlds.params, race.speeds), config.control_interval)
+        race.advance(config.termination.stall_distance)
+        race.training_steps += self.num_envs
+
+    def observe(self, car: int) -> dict[str, np.ndarray]:
+        """What a car is told: (worlds, size) of every term, float32."""
+        return observe(self.race, car, self.config.observation, self.config.scale_observations)
+
+    def outcomes(self, car: int) -> np.ndarray:
+        """How the last step ended each world's episode for a car, "" where it did not: str (worlds,)."""
+        found = outcomes(self.race, car, self.config.termination)
+        self.race.stalled[:, car] = found == STALLED
+        return found
+
+    def rewards(self, car: int, totals: dict[str, np.ndarray] | None = None) -> np.ndarray:
+        """A car's reward for the last step, after `outcomes`: (worlds,). Each term is added to its total."""
+        reward = np.zeros(self.num_envs)
+        for name, weight in self._weights.items():
+            value = weight * REWARD_TERMS[name](self.race, car, self.config.reward)
+            if totals is not None:
+                totals[name] += value
+            reward += value
+        self.race.rewards[:, car] = reward
+        return reward
+
+    def opponent_names(self) -> list[str]:
+        """Of the drivers that opponents are drawn from."""
+        return [] if self._opponents is None else [driver.name for driver in self._opponents.drivers]
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is open."""
@@ -210,21 +249,18 @@ class RaceVectorEnv(VectorEnv):
         self._episode[which] += 1
         episodes = self._episode[which]
         tracks, params = self.tasks.draw(keys, episodes, cars)
-        low, high = bounds(self.config.opponent_speed)
-        share = uniform(keys, episodes, DRIVER_STREAM, cars)
-        self._opponent_speed[which] = low + share * (high - low)
+        self.race.speeds[which] = speed_spans(params, self.config.speed_range)
+        if self._opponents is not None:
+            self.race.speeds[which, 1:] = self._opponents.draw(which, keys, episodes, params[:, 1:])
         noise_keys = keys ^ (episodes.astype(np.uint64) << np.uint64(32))
         waiting = np.arange(len(which))
         for attempt in range(START_ATTEMPTS):
             # The later the attempt, the nearer to the centreline: a narrow place ends the loop all the same.
             spread = 1.0 - attempt / (START_ATTEMPTS - 1)
-            starts = self._draw_starts(
-                keys[waiting],
-                episodes[waiting] * START_ATTEMPTS + attempt,
-                tracks[waiting],
-                params[waiting],
-                spread,
-            )
+            starts = draw_starts(
+                self.config.start, self.race.simulator.atlas, keys[waiting],
+                episodes[waiting] * START_ATTEMPTS + attempt, tracks[waiting], params[waiting], spread,
+            )  # fmt: skip
             self.race.simulator.reset(
                 which[waiting], keys=noise_keys[waiting], tracks=tracks[waiting], params=params[waiting],
                 starts=starts,
@@ -239,37 +275,11 @@ class RaceVectorEnv(VectorEnv):
             )
         self.race.begin(which)
         self._over[which] = False
+        self._down[which] = False
+        self._task[which] = self._task_names(which)
         for total in self._totals.values():
             total[which] = 0.0
         self._totals["lap_time_s"][which] = np.nan
-
-    def _draw_starts(
-        self, keys: np.ndarray, episodes: np.ndarray, tracks: np.ndarray, params: np.ndarray, spread: float
-    ) -> np.ndarray:
-        """Starts (n, cars, 4) for `Simulator.reset`; the cars stand one behind another in random order."""
-        config, cars = self.config.start, self.config.num_cars
-        atlas = self.race.simulator.atlas
-        share = uniform(keys, episodes, START_STREAM, 1 + 5 * cars)
-        each = share[:, 1:].reshape(len(keys), cars, 5)
-        rows, spacing = atlas.index[tracks, ROWS, None], atlas.frame[tracks, SPACING, None]
-        length = rows * spacing
-        low, high = bounds(config.gap)
-        slots = np.cumsum(low + each[..., 0] * (high - low) + params[..., LENGTH], axis=1)
-        place = np.argsort(np.argsort(each[..., 1], axis=1), axis=1)
-        behind = np.take_along_axis(slots, place, axis=1)
-        behind -= behind[:, [EGO]]
-        base = share[:, :1] * length if config.anywhere else np.zeros((len(keys), 1))
-        s = base - behind
-        row = atlas.index[tracks, FIRST_ROW, None] + (s / spacing).astype(np.int64) % rows
-        # The body's half diagonal stays on the track whichever way the car points.
-        body = 0.5 * np.hypot(params[..., LENGTH], params[..., WIDTH]) + START_MARGIN
-        side = 2.0 * each[..., 2] - 1.0
-        room = np.where(side > 0.0, atlas.line[row, WIDTH_LEFT], atlas.line[row, WIDTH_RIGHT]) - body
-        offset = side * np.maximum(room, 0.0) * config.offset * spread
-        error = (2.0 * each[..., 3] - 1.0) * config.heading_error * spread
-        low, high = bounds(config.speed)
-        speed = np.clip(low + each[..., 4] * (high - low), params[..., V_MIN], params[..., V_MAX])
-        return np.stack([s, offset, error, speed], axis=-1)
 
     def _all_actions(self, actions: np.ndarray) -> np.ndarray:
         """The ego's actions, checked and clipped, with those of the opponents: (worlds, cars, 2)."""
@@ -279,56 +289,75 @@ class RaceVectorEnv(VectorEnv):
             raise OutlapError(f"actions are {actions!r:.60}; they must be numbers ({self.num_envs}, 2)") from None
         if actions.shape != (self.num_envs, 2):
             raise OutlapError(f"actions have shape {actions.shape}; they must be ({self.num_envs}, 2)")
-        if self._over.any():
-            raise OutlapError(f"world {np.argmax(self._over)}: its episode is over or never began; call reset first")
         if not np.isfinite(actions).all():
             world = int(np.argwhere(~np.isfinite(actions))[0, 0])
             raise OutlapError(f"actions: that of world {world} is {actions[world].tolist()}; it must be finite")
         everyone = np.empty((self.num_envs, self.config.num_cars, 2), np.float32)
         everyone[:, EGO] = np.clip(actions, -1.0, 1.0)
-        driver = self._opponents
-        for car in range(1, self.config.num_cars):
-            seen = observe(self.race, car, driver.observation_terms, driver.scale_observations)
-            everyone[:, car] = driver.act(seen)
+        if self.config.num_cars > 1 and not self._over.any():
+            if self._opponents is None:
+                raise OutlapError("opponents: none given; step drives the first car only, advance all of them")
+            everyone[:, 1:] = self._opponents.act()
         return everyone
 
-    def _reward(self) -> np.ndarray:
-        total = np.zeros(self.num_envs)
-        for name, weight in self._weights.items():
-            value = weight * REWARD_TERMS[name](self.race, self.config.reward)
-            self._totals[name] += value
-            total += value
-        self.race.rewards[:] = total
-        return total
+    def _find_opponents(self, names: Sequence[Named]) -> Opponents | None:
+        config = self.config
+        if config.num_cars == 1 or not names:
+            return None
+        drivers = find_drivers(names, config.field_of_view, config.opponent_split, config.opponent_code)
+        return Opponents(drivers, self.race, config.opponent_speed, config.opponent_noise)
+
+    def _clear_wrecks(self) -> None:
+        """Do with opponents that crashed as configured, and count them."""
+        simulator, contact = self.race.simulator, self.race.worlds.contact
+        wrecks = (contact == HIT_WALL) | (contact == HIT_CAR)
+        wrecks[:, EGO] = False
+        self._totals["opponent_crashes"] += (wrecks[:, 1:] & ~self._down).sum(axis=1)
+        self._down[:] = contact[:, 1:] != FREE
+        if self.config.opponent_crash != "park" and self._down.any():
+            simulator.remove(wrecks)
+            if self.config.opponent_crash == "respawn":
+                simulator.respawn(RESPAWN_CLEARANCE)
 
     def _count(self, rewards: np.ndarray) -> None:
         """Add a step to what is told about each episode."""
         race, totals, worlds = self.race, self._totals, self.race.worlds
         totals["episode_return"] += rewards
         totals["episode_steps"] += 1
-        totals["mean_speed_mps"] += (race.speed - totals["mean_speed_mps"]) / totals["episode_steps"]
-        totals["progress_m"][:] = race.distance - race.start
+        totals["mean_speed_mps"] += (race.speed[:, EGO] - totals["mean_speed_mps"]) / totals["episode_steps"]
+        totals["progress_m"][:] = race.distance[:, EGO] - race.start[:, EGO]
         # The mean of all laps so far: each new one moves it by its share.
         new = worlds.laps[:, EGO] > totals["completed_laps"]
         totals["completed_laps"][:] = worlds.laps[:, EGO]
         if new.any():
             before = np.nan_to_num(totals["lap_time_s"][new])
             totals["lap_time_s"][new] = before + (worlds.lap_time[new, EGO] - before) / worlds.laps[new, EGO]
-        totals["overtakes"] += race.places_gained
-        totals["places_lost"] += race.places_lost
+        totals["overtakes"] += race.places_gained[:, EGO]
+        totals["places_lost"] += race.places_lost[:, EGO]
         totals["impact_speed_mps"][:] = worlds.impact_speed[:, EGO]
+        if self.config.num_cars > 1:
+            self._clear_wrecks()
 
-    def _observe(self) -> dict[str, np.ndarray]:
-        return observe(self.race, EGO, self.config.observation, self.config.scale_observations)
+    def _task_names(self, which: np.ndarray) -> list[str]:
+        """What tells the tasks of some worlds apart: the track, and the drivers of the opponents."""
+        tracks = self._names[self.race.worlds.track[which]].tolist()
+        if self._opponents is None:
+            return tracks
+        rivals = self._opponents.names()[which].tolist()
+        return [f"{track} against {', '.join(sorted(names))}" for track, names in zip(tracks, rivals, strict=True)]
 
     def _info(self, outcome: np.ndarray | None = None) -> dict[str, Any]:
         """What is known of each world; a key's mask says for which."""
-        worlds = self.race.worlds
+        worlds, opponents = self.race.worlds, self._opponents
+        nobody = np.zeros((self.num_envs, self.config.num_cars - 1))
         info: dict[str, Any] = {
             "outcome": np.full(self.num_envs, RUNNING) if outcome is None else outcome,
             "track": self._names[worlds.track],
+            "task": self._task.copy(),
             "vehicle": worlds.params.copy(),
-            "opponent_speed_mps": self._opponent_speed[:, 1:].copy(),
+            "contact": CONTACTS[worlds.contact[:, EGO]],
+            "opponents": np.full(nobody.shape, "", object) if opponents is None else opponents.names(),
+            "opponent_speed_mps": nobody if opponents is None else opponents.top_speed.copy(),
             "laps": worlds.laps[:, EGO].copy(),
             "last_lap_time_s": worlds.lap_time[:, EGO].copy(),
             "time_s": worlds.time.copy(),

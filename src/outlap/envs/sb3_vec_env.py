@@ -12,7 +12,7 @@ from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
 from outlap.errors import OutlapError
 
 # Of every world at every step; the rest of the information is given when an episode ends.
-EVERY_STEP = ("track",)
+EVERY_STEP = ("track", "task")
 
 
 class SB3VecEnv(VecEnv):

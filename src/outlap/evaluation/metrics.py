@@ -32,7 +32,8 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
     Returns:
         {"all": summary, "tracks": {name: summary}}. A summary has the number of `episodes`, `crash_rate` with
         its Wilson interval `crash_rate_low` … `crash_rate_high`, the total `overtakes` and `places_lost`, how
-        many episodes had which of the `outcomes`, and for each of MEANS a {mean, sd, low, high} with the 95 %
+        many episodes had which of the `outcomes`, with what the ego made `contacts`, how often an opponent crashed
+        (`opponent_crashes`), and for each of MEANS a {mean, sd, low, high} with the 95 %
         interval of the mean. What is not known is None.
     """
     tracks = rows.groupby("track", sort=False)  # in the order of the evaluation
@@ -86,6 +87,8 @@ def _summary(rows: pd.DataFrame) -> dict[str, Any]:
         "overtakes": int(rows["overtakes"].to_numpy().sum()),
         "places_lost": int(rows["places_lost"].to_numpy().sum()),
         "outcomes": outcomes,
+        "contacts": {kind: int(np.count_nonzero(rows["contact"] == kind)) for kind in ("wall", "car")},
+        "opponent_crashes": int(rows["opponent_crashes"].to_numpy().sum()),
         **{name: _mean(rows[name].to_numpy()) for name in MEANS},
     }
 

@@ -17,6 +17,7 @@ import pandas as pd
 from gymnasium.vector import AutoresetMode
 
 from outlap.drivers.driver import Driver
+from outlap.drivers.find import find_drivers
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig, StartConfig
@@ -66,7 +67,7 @@ def standing_starts(
     changes = {
         "tracks": tuple(track.name for track in tracks),
         "augment_tracks": False,
-        "start": StartConfig(anywhere=True, speed=0.0, gap=env.start.gap),
+        "start": StartConfig(anywhere=True, speed=0.0, gap=env.start.gap, formation=env.start.formation),
         "termination": TerminationConfig(laps=laps, time_limit=time_limit),
     }
     return env.model_copy(update=changes)
@@ -106,9 +107,10 @@ def evaluate(
         A row an episode, in the order of the tracks and of their seeds: track, episode (its number), seed,
         driver, outcome, terminated, truncated, episode_steps, duration_s, episode_return, last_reward,
         overtakes, places_lost, completed_laps, lap_time_s (mean of its laps, NaN without one), start_m (arc
-        length), progress_m, mean_speed_mps, impact_speed_mps (NaN without a crash), and one column for each of
-        the ego's parameters that is drawn, such as vehicle_mu, and for the speed of each opponent if that is
-        drawn (opponent_1_speed_mps).
+        length), progress_m, mean_speed_mps, contact (what the ego hit: wall, car or nothing), impact_speed_mps (NaN
+        without a crash, relative to what was hit), opponent_crashes, one column for each of the ego's parameters that
+        is drawn, such as vehicle_mu, the driver of each opponent (opponent_1), and its top speed if that is drawn
+        (opponent_1_speed_mps).
 
     Raises OutlapError for tracks that cannot be loaded or share a name, an observation that the driver does
     not take, episodes that may never end.
@@ -157,7 +159,7 @@ def _race(
 ) -> tuple[list[dict[str, Any]], int]:
     """Every episode of one track: its rows, and the steps that they took."""
     worlds = min(num_worlds, len(seeds))
-    env = RaceVectorEnv(worlds, **_settings(driver, config, track), autoreset_mode=AutoresetMode.DISABLED)
+    env = RaceVectorEnv(worlds, **episode_settings(driver, config, track), autoreset_mode=AutoresetMode.DISABLED)
     if isinstance(driver, PolicyDriver):
         driver.check(env.single_observation_space)
     drawn = drawn_parameters(config)
@@ -168,7 +170,7 @@ def _race(
     upcoming = worlds
     observation, _ = env.reset(seed=seeds[:worlds].tolist())
     driver.begin(np.ones(worlds, bool))
-    start = env.race.start.copy()
+    start = env.race.start[:, EGO].copy()
     steps = 0
     while len(rows) < len(seeds):
         env.training_steps = CURRICULA_OVER
@@ -188,6 +190,7 @@ def _race(
                 "last_reward": float(rewards[world]),
                 "start_m": float(start[world] % length),
                 **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
+                **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in range(1, config.num_cars)},
                 **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in opponents},
             }
         if over.any():
@@ -199,19 +202,21 @@ def _race(
                     upcoming += 1
             observation, info = env.reset(seed=again, options={"reset_mask": over})
             driver.begin(over)
-            start[over] = env.race.start[over]
+            start[over] = env.race.start[over, EGO]
         watch(len(rows), len(rows) + _underway(config, length, start, info, racing != IDLE), steps)
     return [rows[episode] for episode in range(len(seeds))], steps
 
 
-def _settings(driver: Driver, config: RaceConfig, track: Track) -> dict[str, Any]:
+def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[str, Any]:
     """Keywords of the environment that this driver needs."""
     settings = dict(config)
     settings["tracks"] = [track]
     settings["augment_tracks"] = False  # the track that was named, not one of its variants
     settings["observation"] = driver.observation_terms
     settings["scale_observations"] = driver.scale_observations
-    if "scan" not in driver.observation_terms:
+    names = config.opponents if config.num_cars > 1 else ()
+    others = find_drivers(names, config.field_of_view, config.opponent_split, config.opponent_code)
+    if not any("scan" in each.observation_terms for each in (driver, *others)):
         settings["beams"] = 0  # nobody looks
     return settings
 
@@ -230,7 +235,9 @@ def _row(info: dict[str, Any], world: int) -> dict[str, Any]:
         "lap_time_s": float(info["lap_time_s"][world]),
         "progress_m": float(info["progress_m"][world]),
         "mean_speed_mps": float(info["mean_speed_mps"][world]),
+        "contact": str(info["contact"][world]),
         "impact_speed_mps": float(info["impact_speed_mps"][world]) if crashed else float("nan"),
+        "opponent_crashes": int(info["opponent_crashes"][world]),
     }
 
 

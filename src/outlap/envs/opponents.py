@@ -1,0 +1,159 @@
+"""Who drives the other cars: a driver, a top speed and an unsteadiness drawn for each of them in every episode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from outlap.config import Number, bounds
+from outlap.drivers.driver import Driver
+from outlap.drivers.mlp import DriverStack, MLPDriver
+from outlap.envs.observations import OBSERVATION_TERMS, observe
+from outlap.envs.race import Race
+from outlap.errors import OutlapError
+from outlap.seeding import DRIVER_STREAM, NOISE_STREAM, uniform
+from outlap.simulator.vehicle import V_MAX
+
+LONGEST_EPISODE = 1 << 32  # steps: apart by so many, the noise of two episodes never meets
+
+
+class Opponents:
+    """The cars behind the ego's in the arrays of a `Race`, (worlds, cars - 1) here.
+
+    Perceptrons of one architecture are asked as one batch. Any other driver is asked about all cars, its own or not:
+    so it has each in the same row from step to step, and one that remembers is told whose episode begins.
+    """
+
+    def __init__(self, drivers: Sequence[Driver], race: Race, top_speed: Number | None, noise: Number) -> None:
+        """Put them into the cars of a race.
+
+        Args:
+            drivers: to draw from.
+            race: whose cars they drive.
+            top_speed: [m/s] of their cars; (low, high) is drawn, None leaves them as they are.
+            noise: standard deviation of their actions, drawn likewise.
+        """
+        worlds, cars = race.speeds.shape[:2]
+        self.drivers = drivers
+        self.race = race
+        self._top_speed = (np.inf, np.inf) if top_speed is None else bounds(top_speed)
+        self._noise = bounds(noise)
+        self.number = np.zeros((worlds, cars - 1), np.int64)  # of its driver in `drivers`
+        self.top_speed = np.zeros((worlds, cars - 1), np.float32)  # [m/s]
+        self.noise = np.zeros((worlds, cars - 1))
+        self._keys = np.zeros(worlds, np.uint64)
+        self._step = np.zeros(worlds, np.uint64)
+        self._begins = np.ones((worlds, cars - 1), bool)
+        spans = [getattr(driver, "speeds", None) or (0.0, np.nan) for driver in drivers]
+        self._spans = np.array(spans, np.float32).reshape(-1, 2)
+        self._names = np.array([driver.name for driver in drivers] or [""], dtype=object)
+        self._groups = _groups(drivers)
+        for driver in drivers:
+            beams = getattr(driver, "beams", None)
+            if beams is not None and beams > race.worlds.scan.shape[2]:
+                raise OutlapError(
+                    f"driver {driver.name}: looks with {beams} beams, and the cars have {race.worlds.scan.shape[2]}; "
+                    f"set beams to {beams} or more"
+                )
+            unknown = [term for term in driver.observation_terms if term not in OBSERVATION_TERMS]
+            if unknown:
+                raise OutlapError(
+                    f"driver {driver.name}: observes {unknown[0]!r}; must be one of {', '.join(OBSERVATION_TERMS)}"
+                )
+
+    def names(self) -> np.ndarray:
+        """Of the drivers at work: object (worlds, cars - 1)."""
+        return self._names[self.number]
+
+    def draw(self, which: np.ndarray, keys: np.ndarray, episodes: np.ndarray, params: np.ndarray) -> np.ndarray:
+        """Draw those of some worlds, (n,) numbers, whose keys and episodes are these.
+
+        Args:
+            params: (n, cars - 1, N_PARAMS) of their cars, whose top speeds are lowered to what is drawn, and to the
+                driver's own.
+
+        Returns:
+            The speeds that their actions -1 and 1 command [m/s]: float32 (n, cars - 1, 2).
+        """
+        cars = self.number.shape[1]
+        share = uniform(keys, episodes, DRIVER_STREAM, 3 * cars).reshape(len(which), 3, cars)
+        (slow, fast), (calm, wild) = self._top_speed, self._noise
+        cap = np.full_like(share[:, 0], slow) if slow == fast else slow + share[:, 0] * (fast - slow)
+        self.number[which] = (share[:, 1] * len(self.drivers)).astype(np.int64)
+        self.noise[which] = calm + share[:, 2] * (wild - calm)
+        self._keys[which] = keys
+        self._step[which] = np.asarray(episodes, np.uint64) * np.uint64(LONGEST_EPISODE)
+        self._begins[which] = True
+        spans = self._spans[self.number[which]]
+        # A trained driver gets the car that it was trained in: how hard a car accelerates goes by its top speed too.
+        params[..., V_MAX] = np.fmin(np.minimum(params[..., V_MAX], cap), spans[..., 1])
+        spans[..., 1] = np.where(np.isnan(spans[..., 1]), params[..., V_MAX], spans[..., 1])
+        self.top_speed[which] = params[..., V_MAX]
+        return spans
+
+    def act(self) -> np.ndarray:
+        """Their actions: float32 (worlds, cars - 1, 2) in [-1, 1].
+
+        Raises OutlapError that names a driver whose actions are not finite, or of a wrong shape.
+        """
+        worlds, cars = self.number.shape
+        out = np.zeros((worlds, cars, 2), np.float32)
+        for numbers, driver in self._groups:
+            mine = np.isin(self.number, numbers)
+            if not mine.any():
+                continue
+            observation = self._observe(driver)
+            if isinstance(driver, DriverStack):
+                which = np.searchsorted(numbers, self.number[mine])
+                out[mine] = driver.act(which, {name: value[mine] for name, value in observation.items()})
+                continue
+            driver.begin(self._begins.ravel())
+            flat = {name: value.reshape(worlds * cars, -1) for name, value in observation.items()}
+            chosen = np.asarray(driver.act(flat))
+            if chosen.shape != (worlds * cars, 2):
+                raise OutlapError(
+                    f"driver {driver.name}: gave actions of shape {chosen.shape}; must be {(worlds * cars, 2)}"
+                )
+            out[mine] = chosen.reshape(worlds, cars, 2)[mine]
+        if not np.isfinite(out).all():
+            wrong = np.argwhere(~np.isfinite(out).all(axis=2))[0]
+            name = self._names[self.number[tuple(wrong)]]
+            raise OutlapError(f"driver {name}: gave the action {out[tuple(wrong)].tolist()}; must be finite")
+        self._begins[:] = False
+        if self.noise.any():
+            out += self.noise[..., None] * self._normal(2 * cars).reshape(worlds, cars, 2)
+        self._step += np.uint64(1)
+        return np.clip(out, -1.0, 1.0)
+
+    def _observe(self, driver: Driver | DriverStack) -> dict[str, np.ndarray]:
+        """What a driver would be told in every car: (worlds, cars - 1, size) of its terms.
+
+        A driver that looks with fewer beams than the cars have gets the nearest ones.
+        """
+        terms, scaled = driver.observation_terms, driver.scale_observations
+        seen = [observe(self.race, car, terms, scaled) for car in range(1, self.number.shape[1] + 1)]
+        observation = {name: np.stack([each[name] for each in seen], axis=1) for name in seen[0]}
+        beams = getattr(driver, "beams", None)
+        if "scan" in observation and beams is not None and beams != observation["scan"].shape[2]:
+            chosen = np.rint(np.linspace(0, observation["scan"].shape[2] - 1, beams)).astype(np.int64)
+            observation["scan"] = observation["scan"][..., chosen]
+        return observation
+
+    def _normal(self, count: int) -> np.ndarray:
+        """Standard normal numbers of this step (worlds, count), by Box and Muller."""
+        share = uniform(self._keys, self._step, NOISE_STREAM, 2 * count)
+        radius = np.sqrt(-2.0 * np.log(1.0 - share[:, :count]))
+        return radius * np.cos(2.0 * np.pi * share[:, count:])
+
+
+def _groups(drivers: Sequence[Driver]) -> list[tuple[np.ndarray, Driver | DriverStack]]:
+    """Drivers that are asked together, with their numbers, ascending."""
+    alike: dict[Any, list[int]] = {}
+    for number, driver in enumerate(drivers):
+        alike.setdefault(driver.architecture if isinstance(driver, MLPDriver) else number, []).append(number)
+    return [
+        (np.array(numbers), DriverStack([drivers[i] for i in numbers]) if isinstance(key, tuple) else drivers[key])  # type: ignore[misc]
+        for key, numbers in alike.items()
+    ]
