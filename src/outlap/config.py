@@ -197,7 +197,12 @@ def explain(error: ValidationError, cls: type[BaseModel] | None = None, prefix: 
         case "missing":
             line = f"{field} is missing; it must be given"
         case "value_error":
-            line = f"{field} is {_short(problem['input'])}; {context['error']}"
+            whole = isinstance(problem["input"], BaseModel)  # of which one field is wrong, as the error says
+            line = (
+                f"{field}: {context['error']}"
+                if whole
+                else f"{field} is {_short(problem['input'])}; {context['error']}"
+            )
         case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal" as kind:
             sign = (">" if kind.startswith("greater") else "<") + ("=" if kind.endswith("equal") else "")
             line = f"{field} is {_short(problem['input'])}; must be {sign} {next(iter(context.values()))}"

@@ -179,10 +179,11 @@ def test_wrong_flags_are_one_line(made, fail, words, message):
 
 
 def test_wrong_runs_are_one_line(made, fail, tmp_path):
-    assert "nowhere: no such run folder" in fail("nowhere")
+    assert "driver is 'nowhere'; must be " in fail("nowhere")
+    assert "a run folder" in fail("nowhere")
     assert "centerline-follower" in fail("centreline")
     (tmp_path / "empty").mkdir()
-    assert "it has no config.yaml" in fail(str(tmp_path / "empty"))
+    assert "no config.yaml" in fail(str(tmp_path / "empty"))
     untrained = create_run(tmp_path / "untrained", PPOConfig(env=ENV))
     assert "holds no policy yet" in fail(str(untrained.folder), "--tracks", "ring4")
     assert "draws nothing" in fail("centerline-follower", "--stochastic", "--tracks", "ring4")

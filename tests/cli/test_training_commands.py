@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -108,9 +109,14 @@ def test_benchmark_refuses_half_a_case(capfd: pytest.CaptureFixture[str]) -> Non
     assert "--cars and --beams go together" in capfd.readouterr().err
 
 
-def test_demo_trains_and_races_on_circuits_it_never_saw(capfd: pytest.CaptureFixture[str]) -> None:
+def test_demo_trains_and_races_on_circuits_it_never_saw(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of it, but for one iteration of the ten, and races of 5 s."""
+    from outlap.cli.adapt import Adapt
     from outlap.track.generate import BUILTIN_HELD_OUT
 
+    monkeypatch.setattr("outlap.cli.adapt.Adapt", partial(Adapt, iterations=1, time_limit=5.0))
     assert main(["demo", "--steps", "100", "--episodes", "1", "--out", "run", "--json", "-", "--quiet"]) == 0
     data = json.loads(capfd.readouterr().out)
     assert data["training"]["steps"] >= 100

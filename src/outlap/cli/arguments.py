@@ -39,8 +39,8 @@ def parse(command: type[CommandT], arguments: Sequence[str], prog: str) -> Comma
     try:
         with contextlib.redirect_stderr(complaint), _no_line_breaks(arguments):
             return tyro.cli(command, args=list(arguments), prog=prog, **default)
-    except SystemExit as stop:
-        if not stop.code:
+    except (SystemExit, ValidationError) as stop:  # tyro lets pass what a Config of all flags refuses
+        if isinstance(stop, SystemExit) and not stop.code:
             raise
         # `from None` would not do: the chain is where pydantic's own error is found.
         message = _value_problem(stop, arguments) or _one_line(complaint.getvalue(), prog)

@@ -8,13 +8,14 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.config import bounds
+from outlap.drivers.find import find_drivers
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Evaluate:
     """
 
     driver: Annotated[Positional[str], arg(metavar="RUN")]
-    """A run folder of `outlap train`, or a driver without one: centerline-follower."""
+    """A run folder of `outlap train`, an opponent such as population/NAME, or a driver without one: pure-pursuit."""
 
     tracks: tuple[str, ...] = ()
     """Names or map folders; by default the run's held-out tracks, or else the built-in held-out ones."""
@@ -55,6 +56,18 @@ class Evaluate:
 
     v_max: float | None = None
     """[m/s] top speed of the cars, in place of the run's; what the policy commands stays within what it learnt."""
+
+    num_cars: int | None = None
+    """The driver's car and opponents; by default as many as the run was trained with."""
+
+    opponents: tuple[str, ...] = ()
+    """Drivers and populations to draw opponents from, in place of the run's."""
+
+    opponent_split: Literal["train", "held_out"] = "held_out"
+    """The half of a population that opponents are drawn from."""
+
+    formation: Literal["queue", "behind", "grid", "scattered"] | None = None
+    """In which the cars start, in place of the run's; behind: the driver's car is the last."""
 
     seed: int = 0
     """Of the episodes."""
@@ -79,10 +92,12 @@ class Evaluate:
         from outlap.envs.tasks import load_tracks
         from outlap.evaluation.rollout import standing_starts
 
-        run, trained_env = self._subject()
+        if self.stochastic and not is_run(self.driver):
+            raise OutlapError(f"--stochastic is for a trained run; {self.driver} draws nothing")
+        driver, trained_env, run = find_subject(self.driver, deterministic=not self.stochastic, seed=self.seed)
         tracks = load_tracks(self.tracks or held_out_tracks(run))
-        env = standing_starts(_with_top_speed(trained_env, self.v_max), tracks, self.laps, self.time_limit)
-        driver = self._driver(run)
+        env = self._with_opponents(with_top_speed(trained_env, self.v_max))
+        env = standing_starts(env, tracks, self.laps, self.time_limit)
         home = run.folder if run else Path("runs") / driver.name
         folder = self.out or unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
         return evaluate_into(
@@ -104,6 +119,7 @@ class Evaluate:
             ("--laps", self.laps, 0),
             ("--seed", self.seed, 0),
             ("--worlds", self.worlds, 1),
+            ("--num-cars", 1 if self.num_cars is None else self.num_cars, 1),
         ):
             check_least(flag, value, least)
         for flag, number in (("--time-limit", self.time_limit), ("--v-max", self.v_max)):
@@ -112,36 +128,50 @@ class Evaluate:
         if self.laps == 0 and self.time_limit is None:
             raise OutlapError("--laps is 0; must be 1 or more, or be given with a --time-limit")
 
-    def _subject(self) -> tuple[Run | None, RaceConfig]:
-        """The run, if there is one, and the environment that the driver is made for."""
-        from outlap.training.ppo import PPOConfig
-        from outlap.training.run import load_run
+    def _with_opponents(self, env: RaceConfig) -> RaceConfig:
+        changes: dict[str, Any] = {"opponent_split": self.opponent_split}
+        if self.num_cars is not None:
+            changes["num_cars"] = self.num_cars
+        if self.opponents:
+            changes |= {"opponents": self.opponents, "opponent_code": True}
+        if self.formation:
+            changes["start"] = env.start.model_copy(update={"formation": self.formation})
+        return env.model_copy(update=changes)
 
-        if Path(self.driver).exists():
-            run = load_run(self.driver)
-            return run, run.config.env
-        if self.driver not in _drivers():
-            raise OutlapError(
-                f"{self.driver}: no such run folder; make one with outlap train ppo, or name a driver: "
-                f"{', '.join(_drivers())}"
-            )
-        return None, PPOConfig().env
 
-    def _driver(self, run: Run | None) -> Driver:
-        if run is None:
-            if self.stochastic:
-                raise OutlapError(f"--stochastic is for a trained policy; {self.driver} draws nothing")
-            return _drivers()[self.driver]()
-        from outlap.drivers.policy import PolicyDriver
+def is_run(name: str) -> bool:
+    """Whether a driver's name is that of a run folder."""
+    return (Path(name) / "config.yaml").is_file()
 
-        return PolicyDriver.load(
-            run.policy_path,
-            algorithm=run.config.model_class(),
-            scale_observations=run.config.env.scale_observations,
-            deterministic=not self.stochastic,
-            seed=self.seed,
-            name=run.folder.resolve().name,
-        )
+
+def find_subject(name: str, *, deterministic: bool = True, seed: int = 0) -> tuple[Driver, RaceConfig, Run | None]:
+    """The one driver that a name stands for, the environment that it is made for, and its run if it has one.
+
+    Args:
+        name: a run folder, or what `drivers.find` knows.
+        deterministic, seed: see `PolicyDriver`; of a run's policy.
+
+    Raises OutlapError for a name that stands for nobody, or for many.
+    """
+    from outlap.training.ppo import PPOConfig
+    from outlap.training.run import load_run
+
+    if is_run(name):
+        run = load_run(name)
+        return run.driver(deterministic=deterministic, seed=seed), run.config.env, run
+    env = PPOConfig().env
+    drivers = find_drivers([name], env.field_of_view, split=None, run_code=True)
+    if len(drivers) > 1:
+        names = ", ".join(driver.name for driver in drivers)
+        raise OutlapError(f"{name}: is a population; name one of its drivers, {name}/NAME: {names}")
+    beams = getattr(drivers[0], "beams", None)
+    if beams is not None:
+        env = env.model_copy(update={"beams": beams})
+    speeds = getattr(drivers[0], "speeds", None)
+    if speeds is not None:  # an opponent drives the car that it was trained in
+        vehicle = env.vehicle.model_copy(update={"v_max": speeds[1]})
+        env = env.model_copy(update={"vehicle": vehicle, "speed_range": speeds})
+    return drivers[0], env, None
 
 
 def evaluate_into(
@@ -272,7 +302,8 @@ def _table(data: Mapping[str, Any], columns: Sequence[str]) -> Table:
 
 def _cell(summary: Mapping[str, Any], column: str) -> str:
     if column == "crashes":
-        return str(summary["outcomes"]["crash"])
+        into_cars = summary["contacts"]["car"]
+        return f"{summary['outcomes']['crash']}" + (f"\n{into_cars} into cars" if into_cars else "")
     if column == "crash_rate":
         low, high = (100.0 * summary[f"crash_rate_{end}"] for end in ("low", "high"))
         return f"{100.0 * summary['crash_rate']:.1f} %\n[{low:.1f}, {high:.1f}]"
@@ -290,13 +321,6 @@ def _cell(summary: Mapping[str, Any], column: str) -> str:
     )
 
 
-def _drivers() -> dict[str, Any]:
-    """Classes of the drivers that need no run, by name."""
-    from outlap.drivers.centerline_follower import CenterlineFollower
-
-    return {CenterlineFollower.name: CenterlineFollower}
-
-
 def held_out_tracks(run: Run | None) -> tuple[str, ...]:
     """Names of the tracks that a run has kept from its training, or else the built-in ones."""
     from outlap.track.generate import BUILTIN_HELD_OUT
@@ -304,7 +328,7 @@ def held_out_tracks(run: Run | None) -> tuple[str, ...]:
     return (run.config.held_out_tracks if run else ()) or BUILTIN_HELD_OUT
 
 
-def _with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
+def with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
     """The task with another top speed of the cars; actions go on to mean the speeds that they were trained with."""
     if v_max is None:
         return env

@@ -51,9 +51,14 @@ COMMANDS = (
     Entry("tracks download", "outlap.cli.tracks:DownloadTracks", "get circuits from the official archive"),
     Entry("train ppo", "outlap.cli.train:TrainPPO", "train a policy with PPO and domain randomization"),
     Entry("train mql", "outlap.cli.train:TrainMQL", "meta-train a policy with Meta-Q-Learning"),
+    Entry("opponents train", "outlap.cli.opponents:TrainOpponents", "train a population of opponents"),
+    Entry("opponents verify", "outlap.cli.opponents:VerifyOpponents", "race every opponent alone again"),
+    Entry("opponents record", "outlap.cli.opponents:RecordLap", "record a lap that a ghost can drive again"),
+    Entry("opponents list", "outlap.cli.opponents:ListOpponents", "list the opponents of a population"),
     Entry("adapt", "outlap.cli.adapt:Adapt", "adapt a meta-trained policy to tracks, and race it before and after"),
     Entry("evaluate", "outlap.cli.evaluate:Evaluate", "race a trained policy on tracks and measure it"),
     Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),
+    Entry("benchmark racing", "outlap.cli.benchmark:BenchmarkRacing", "measure races against opponents"),
     Entry("benchmark mql", "outlap.cli.benchmark:BenchmarkMQL", "measure updates of Meta-Q-Learning"),
     Entry("demo", "outlap.cli.demo:Demo", "meta-train, adapt and race on built-in circuits in a few minutes"),
 )
@@ -89,6 +94,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:
+        # `| head` has seen enough; nor may the interpreter complain when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OUTPUT_CLOSED
 
 
 def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:
@@ -104,12 +113,7 @@ def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:
     only_json = command.json == STANDARD_OUTPUT
     with standard_output_kept_clean() if only_json else contextlib.nullcontext():
         result = command.run()
-    try:
-        deliver(result, command.json)
-    except BrokenPipeError:
-        # `| head` has seen enough; nor may the interpreter complain when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OUTPUT_CLOSED
+    deliver(result, command.json)
     return DONE
 
 

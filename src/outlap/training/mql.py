@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class MQLConfig(TrainingConfig):
     """A meta-training. The defaults are for two cores; `--preset paper` has the paper's networks."""
 
-    algorithm: Literal["mql"] = "mql"  # type: ignore[assignment] - narrower than the base class's
+    algorithm: Literal["mql"] = "mql"  # type: ignore[assignment]
     env: RaceConfig = PPOConfig().env.model_copy(
         update={
             "observation": ("scan", "vel", "heading", "previous_action", "previous_reward"),

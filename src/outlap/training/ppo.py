@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class PPOConfig(TrainingConfig):
     """A PPO training. The defaults learn to lap circuits that they never saw within minutes on two cores."""
 
-    algorithm: Literal["ppo"] = "ppo"  # type: ignore[assignment] - narrower than the base class's
+    algorithm: Literal["ppo"] = "ppo"  # type: ignore[assignment]
     env: RaceConfig = RaceConfig(
         augment_tracks=True,
         beams=108,

@@ -23,11 +23,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from outlap.config import read_yaml, save_config, validate
+from outlap.config import bounds, read_yaml, save_config, validate
 from outlap.errors import OutlapError
 from outlap.files import atomic_write, replacing, to_json
 
 if TYPE_CHECKING:
+    from outlap.drivers.policy import PolicyDriver
     from outlap.training.session import TrainingConfig
 
 CHECKPOINTS_KEPT = 3
@@ -54,6 +55,22 @@ class Run:
     def replay_path(self) -> Path:
         """The replay of a learner that has one."""
         return self.folder / "replay.npz"
+
+    def driver(self, *, deterministic: bool = True, seed: int = 0) -> PolicyDriver:
+        """The policy as a driver. Its zip can run code when it is loaded: load those of people you trust."""
+        from outlap.drivers.policy import PolicyDriver
+
+        env = self.config.env
+        slowest, fastest = env.speed_range or (bounds(env.vehicle.v_min)[0], None)
+        return PolicyDriver.load(
+            self.policy_path,
+            algorithm=self.config.model_class(),
+            scale_observations=env.scale_observations,
+            deterministic=deterministic,
+            seed=seed,
+            name=self.folder.resolve().name,
+            speeds=(slowest, bounds(env.vehicle.v_max)[1] if fastest is None else fastest),
+        )
 
     def checkpoints(self) -> list[Path]:
         """Checkpoints, newest first."""

@@ -8,10 +8,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
+from tyro.conf import arg
 
 from outlap.config import Config
 from outlap.envs.race_config import RaceConfig
@@ -33,7 +34,7 @@ class TrainingConfig(Config):
     algorithm: str
     env: RaceConfig = RaceConfig()
     held_out_tracks: tuple[str, ...] = ()  # what `outlap evaluate` takes by default; refused if also trained on
-    total_steps: int = Field(default=2_000_000, gt=0)  # actions, all worlds together
+    total_steps: Annotated[int, arg(aliases=["--steps"])] = Field(default=2_000_000, gt=0)  # actions, all worlds
     num_envs: int = Field(default=128, ge=1)
     seed: int = Field(default=0, ge=0)
     learning_rate: float = Field(default=5e-4, gt=0)
@@ -42,6 +43,13 @@ class TrainingConfig(Config):
     device: str = "cpu"
     threads: int = Field(default=0, ge=0)  # of PyTorch; 0 = one a core
     checkpoint_every: int = Field(default=250_000, gt=0)  # actions
+
+    @field_validator("env")
+    @classmethod
+    def _held_out_opponents_are_for_evaluation(cls, env: RaceConfig) -> RaceConfig:
+        if env.opponent_split != "train":
+            raise ValueError("opponent_split is 'held_out'; must be 'train': no training meets the held-out half")
+        return env
 
     @abstractmethod
     def make_model(self, environment: SB3VecEnv) -> BaseAlgorithm:

@@ -1,0 +1,265 @@
+"""`outlap opponents train | verify | list`."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from outlap.cli.arguments import check_least
+from outlap.cli.output import CommandResult
+from outlap.cli.progress import progress_bar
+from outlap.drivers.population import Split, load_population, read_manifest
+from outlap.errors import OutlapError
+from outlap.training.population import opponent_defaults
+from outlap.training.ppo import PPOConfig
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Console
+
+    from outlap.training.population import Opponent
+
+Flag = FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True)
+class TrainOpponents:
+    """Train a population of opponents: one PPO policy for every top speed, verified before it may race.
+
+    A population that was stopped goes on with the same command.
+    """
+
+    track: str
+    """Name or map folder of the track to train on."""
+
+    out: Path | None = None
+    """The population's folder; by default populations/TRACK."""
+
+    speeds: str = "2.0:6.0:0.5"
+    """Top speeds [m/s] of those to train against: first:last:step."""
+
+    held_out: tuple[float, ...] = (6.5, 7.0)
+    """Top speeds [m/s] of those that training never meets."""
+
+    settings: Annotated[PPOConfig, arg(name="")] = field(default_factory=opponent_defaults)
+
+    laps: int = 5
+    """Consecutive laps that an opponent must complete from every start."""
+
+    starts: int = 20
+    """Of its verification."""
+
+    jobs: int = 0
+    """Trainings at a time; 0: one a core."""
+
+    quiet: Flag = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        from outlap.track import Track
+        from outlap.training.population import Plan, train_population
+
+        check_least("--laps", self.laps, 1)
+        check_least("--starts", self.starts, 1)
+        check_least("--jobs", self.jobs, 0)
+        track = Track.load(self.track)
+        folder = self.out or Path("populations") / track.name
+        opponents = _opponents(track.name, _span(self.speeds), self.held_out)
+        command = shlex.join(["outlap", *sys.argv[1:]])
+        plan = Plan(self.settings, folder, track, self.track, opponents, self.laps, self.starts, command)
+        found = {}
+        with progress_bar("training", len(opponents) * self.settings.total_steps, "steps", self.quiet) as update:
+            try:
+                for opponent, rows, passed in train_population(plan, self.jobs, update):
+                    found[opponent.name] = _row(opponent, rows, passed)
+            except KeyboardInterrupt:
+                print("\nsaved; go on with the same command", file=sys.stderr)
+                raise
+        rows = [found[opponent.name] for opponent in opponents]
+        data = {"folder": folder, "opponents": rows}
+        return CommandResult(data, lambda console: _print(console, rows, folder))
+
+
+@dataclass(frozen=True)
+class RecordLap:
+    """Record a flying lap of a driver alone; the file is an opponent (a ghost) for that track."""
+
+    driver: Annotated[Positional[str], arg(metavar="RUN")]
+    """A run folder of `outlap train`, an opponent such as population/NAME, or a driver without one: pure-pursuit."""
+
+    track: str
+    """Name or map folder of the track."""
+
+    out: Path
+    """The csv file to write: t_s, x_m, y_m, yaw_rad, vx_mps."""
+
+    v_max: float | None = None
+    """[m/s] top speed of the car, in place of the driver's own."""
+
+    seed: int = 0
+    """Of the start."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        from outlap.cli.evaluate import find_subject, with_top_speed
+        from outlap.drivers.ghost import Ghost
+        from outlap.evaluation.recording import record_lap
+        from outlap.track import Track
+
+        if self.out.suffix != ".csv":
+            raise OutlapError(f"--out is {self.out}; must end in .csv, by which a recorded lap is known")
+        if self.v_max is not None and not 0.0 < self.v_max < math.inf:
+            raise OutlapError(f"--v-max is {self.v_max}; must be > 0")
+        driver, env, _ = find_subject(self.driver)
+        env = with_top_speed(env, self.v_max)
+        lap = record_lap(driver, env, Track.load(self.track), self.seed)
+        try:
+            path = Ghost(lap, self.out.stem).save(self.out)
+        except OSError as error:
+            raise OutlapError(f"--out {self.out}: cannot be written: {error.strerror}") from None
+        data = {"lap": path, "lap_time_s": float(lap[-1, 0]), "points": len(lap)}
+        return CommandResult(
+            data,
+            lambda console: console.print(
+                f"{lap[-1, 0]:.2f} s, {len(lap)} points: {path}", highlight=False, markup=False, soft_wrap=True
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class ListOpponents:
+    """List the opponents of a population."""
+
+    folder: Annotated[Positional[Path | None], arg(metavar="FOLDER")] = None
+    """The population; by default the one that comes with outlap."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        from outlap.drivers.population import SHIPPED
+
+        folder = self.folder or SHIPPED
+        keys = ("name", "max_speed_mps", "split", "track", "verified_laps", "crash_rate", "lap_time_s")
+        rows = [{key: getattr(member, key) for key in keys} for member in read_manifest(folder)]
+        return CommandResult({"opponents": rows}, lambda console: _print(console, rows, folder))
+
+
+def _opponents(track: str, speeds: Sequence[float], held_out: Sequence[float]) -> list[Opponent]:
+    """Those to train, named after their track and top speed."""
+    from outlap.training.population import SLOWEST, Opponent
+
+    halves: tuple[tuple[Split, Sequence[float]], ...] = (("train", speeds), ("held_out", held_out))
+    prefix = re.sub(r"[^\w.-]+", "-", track)
+    opponents = [Opponent(f"{prefix}-{speed:.1f}", speed, split) for split, half in halves for speed in half]
+    names = [opponent.name for opponent in opponents]
+    for opponent in opponents:
+        if not SLOWEST < opponent.max_speed_mps < math.inf:
+            raise OutlapError(f"a top speed is {opponent.max_speed_mps}; must be more than {SLOWEST} m/s")
+        if names.count(opponent.name) > 1:
+            raise OutlapError(
+                f"two opponents would be called {opponent.name}; name each top speed once, in --speeds or --held-out, "
+                "0.1 m/s or more apart"
+            )
+    return opponents
+
+
+def _span(text: str) -> list[float]:
+    """first:last:step as the numbers that it means."""
+    try:
+        first, last, step = (float(word) for word in text.split(":"))
+        count = math.floor((last - first) / step + 1e-6)
+        if step <= 0.0 or count < 0:
+            raise ValueError
+    except (ValueError, ArithmeticError):
+        raise OutlapError(f"--speeds is {text!r}; must be first:last:step, such as 2.0:6.0:0.5") from None
+    return [round(first + i * step, 6) for i in range(count + 1)]
+
+
+@dataclass(frozen=True)
+class VerifyOpponents:
+    """Race every opponent of a population alone again, and take those that fail out of its manifest."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """The population."""
+
+    laps: int = 5
+    """Consecutive laps that an opponent must complete from every start."""
+
+    starts: int = 20
+    """Standing starts anywhere on the lap."""
+
+    quiet: Flag = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        from outlap.track import Track
+        from outlap.training.population import Opponent, enter, verify
+
+        check_least("--laps", self.laps, 1)
+        check_least("--starts", self.starts, 1)
+        members = {member.name: member for member in read_manifest(self.folder)}
+        drivers = load_population(self.folder, split=None)
+        rows = []
+        with progress_bar("verifying", len(drivers), "opponents", self.quiet) as update:
+            for driver in drivers:
+                member = members[driver.name]
+                track = Track.load(member.track)
+                found = verify(driver, PPOConfig().env, track, self.laps, self.starts)
+                opponent = Opponent(member.name, member.max_speed_mps, member.split)
+                kept = enter(self.folder, opponent, found, member.track, self.laps, member.command)
+                rows.append(_row(opponent, found, kept is not None))
+                update(len(rows), driver.name)
+        data = {"folder": self.folder, "opponents": rows}
+        return CommandResult(data, lambda console: _print(console, rows, self.folder))
+
+
+def _row(opponent: Opponent, rows: pd.DataFrame, verified: bool) -> dict[str, Any]:
+    from outlap.training.population import crash_rate
+
+    lap_times = rows["lap_time_s"].to_numpy()
+    return {
+        "name": opponent.name,
+        "max_speed_mps": opponent.max_speed_mps,
+        "split": opponent.split,
+        "verified": verified,
+        "verified_laps": int(rows["completed_laps"].to_numpy().min()),
+        "crash_rate": crash_rate(rows),
+        "lap_time_s": None if np.isnan(lap_times).all() else float(np.nanmean(lap_times)),
+    }
+
+
+def _print(console: Console, rows: Sequence[dict[str, Any]], folder: Path) -> None:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("opponent", "top speed [m/s]", "half", "laps", "crash rate", "lap time [s]", ""):
+        left = heading in ("opponent", "half", "")
+        table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "opponent")
+    for row in rows:
+        lap_time = "-" if row["lap_time_s"] is None else f"{row['lap_time_s']:.1f}"
+        failed = "" if row.get("verified", True) else "failed: left out"
+        table.add_row(
+            row["name"], f"{row['max_speed_mps']:.1f}", row["split"].replace("_", " "), str(row["verified_laps"]),
+            f"{row['crash_rate']:.0%}", lap_time, failed,
+        )  # fmt: skip
+    console.print(table)
+    console.print(f"population: {folder}", highlight=False, markup=False, soft_wrap=True)
