@@ -43,6 +43,14 @@ def test_a_stack_gives_each_car_its_own_drivers_action() -> None:
     assert DriverStack(drivers).act(np.zeros(0, np.int64), observations(0)).shape == (0, 2)
 
 
+def test_an_action_does_not_depend_on_the_cars_beside_it_by_a_single_bit() -> None:
+    seen = observations(127)
+    together = driver().act(seen)
+    for count in (1, 2, 17, 100):
+        some = driver().act({name: value[:count] for name, value in seen.items()})
+        np.testing.assert_array_equal(some, together[:count])
+
+
 def test_a_file_brings_back_the_same_driver(tmp_path: Path) -> None:
     driver().save(tmp_path / "v2.0")
     again = MLPDriver.load(tmp_path / "v2.0")

@@ -8,6 +8,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from outlap.envs.parallel_env import RaceParallelEnv
 from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.rewards import REWARD_TERMS
 from outlap.errors import OutlapError
 
 LIMITS = {"time_limit": 0.5}
@@ -94,7 +95,7 @@ def test_a_car_that_stalls_is_truncated_and_leaves_the_track(big_circle):
 def test_every_car_is_told_its_place_and_rewarded_for_overtaking(big_circle):
     env = RaceParallelEnv(
         2, tracks=[big_circle], beams=0, speed_range=(0.0, 8.0), termination={"time_limit": 0.0, "stall_time": 0.0},
-        reward={"weights": {"progress": 0.0, "overtake": 20.0, "steering_change": 0.0, "speed_change": 0.0}},
+        reward={"weights": {**dict.fromkeys(REWARD_TERMS, 0.0), "overtake": 20.0, "overtaken": 20.0}},
     )  # fmt: skip
     _, infos = env.reset(seed=0)
     assert sorted(info["place"] for info in infos.values()) == [1, 2]

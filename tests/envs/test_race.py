@@ -9,7 +9,7 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_TERMS
 
 LENGTH = 0.58  # [m] of a car
-OVERTAKE_ONLY = {"weights": {**dict.fromkeys(REWARD_TERMS, 0.0), "overtake": 20.0}}
+OVERTAKE_ONLY = {"weights": {**dict.fromkeys(REWARD_TERMS, 0.0), "overtake": 20.0, "overtaken": 20.0}}
 NO_LIMITS = {"time_limit": 0.0, "stall_time": 0.0}
 
 

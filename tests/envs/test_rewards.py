@@ -55,6 +55,7 @@ def test_the_reward_is_the_sum_of_what_the_info_logs(ellipse, follow):
             )
             episodes += over.sum()
     assert episodes > 3
+    del used["overtaken"]  # nobody here is faster than the ego; see test_race
     assert min(used.values()) > 0.0, f"a term never counted: {used}"
 
 
@@ -221,6 +222,7 @@ def test_the_papers_preset():
     assert config.resolved() == {
         "milestone": 5.0, "lap_progress": 100.0, "collision": 1.0, "velocity_matching": 10.0,
         "steering_change": 0.05, "overtake": 20.0,
+        "overtaken": 20.0,
     }  # fmt: skip
     assert config.milestones == 10
     assert config.collision_max > 1.0
@@ -240,6 +242,7 @@ def test_weights_replace_the_presets(ellipse):
     _, info = env.reset(seed=0)
     assert env.config.reward.resolved() == {
         "lap_progress": 100.0, "collision": 1.0, "velocity_matching": 10.0, "steering_change": 0.05, "overtake": 7.0,
+        "overtaken": 20.0,
     }  # fmt: skip
     assert "reward_milestone" not in info
     assert "reward_overtake" in info

@@ -131,6 +131,22 @@ def test_a_respawned_car_stands_on_the_centreline_where_it_crashed_and_goes_on(b
     assert worlds.distance[0, 1] > 22.0, "and between two crashes it gets further"
 
 
+def test_whoever_went_by_while_a_car_was_off_the_track_has_overtaken_nobody(big_circle, put):
+    env = race(big_circle, stands, opponent_crash="respawn")
+    put(env, np.array([[10.0, 0.6, 0.0, 0.0], [20.0, 0.0, 0.0, 0.0]]))
+    env.race.simulator.remove(np.array([[False, True]]))
+    env.race.advance(0.3)
+    env.race.worlds.distance[0, 0] = 30.0
+    env.race.advance(0.3)
+    env.race.simulator.respawn(3.0)
+    for gained in (0, 0):
+        env.race.advance(0.3)
+        assert env.race.places_gained[0, 0] == gained
+    env.race.worlds.distance[0, 0] = 10.0
+    env.race.advance(0.3)
+    assert env.race.places_lost[0, 0] == 1, "from then on places count again"
+
+
 def test_a_car_comes_back_only_where_there_is_room(big_circle, put):
     """The ego stands beside the wreck: the opponent waits until it has gone."""
     env = race(big_circle, straight_on, opponent_crash="respawn")

@@ -288,6 +288,9 @@ class BenchmarkRacing:
     opponents: tuple[str, ...] = ("population",)
     """Drivers and populations; the training half of the one that comes with outlap by default."""
 
+    opponent_code: FlagCreatePairsOff[bool] = False
+    """Load opponents that can run code when they are loaded: run folders, module:function."""
+
     worlds: int = 128
     """Races in lock-step."""
 
@@ -328,7 +331,7 @@ def _measure_racing(settings: BenchmarkRacing) -> dict[str, Any]:
 
     env = RaceVectorEnv(
         settings.worlds, tracks=settings.tracks, num_cars=settings.cars, beams=settings.beams,
-        control_interval=settings.control_interval, opponents=settings.opponents, opponent_code=True,
+        control_interval=settings.control_interval, opponents=settings.opponents, opponent_code=settings.opponent_code,
         scale_observations=True, observation=("scan", "vel", "heading", "previous_action"), speed_range=(0.0, 8.0),
     )  # fmt: skip
     env.reset(seed=0)

@@ -61,7 +61,10 @@ class Evaluate:
     """The driver's car and opponents; by default as many as the run was trained with."""
 
     opponents: tuple[str, ...] = ()
-    """Drivers and populations to draw opponents from, in place of the run's."""
+    """Drivers and populations to draw opponents from, in place of the run's; one where the run had none."""
+
+    opponent_code: Flag = False
+    """Load opponents that can run code when they are loaded: run folders, module:function."""
 
     opponent_split: Literal["train", "held_out"] = "held_out"
     """The half of a population that opponents are drawn from."""
@@ -133,7 +136,9 @@ class Evaluate:
         if self.num_cars is not None:
             changes["num_cars"] = self.num_cars
         if self.opponents:
-            changes |= {"opponents": self.opponents, "opponent_code": True}
+            changes |= {"num_cars": max(2, env.num_cars), **changes, "opponents": self.opponents}
+        if self.opponent_code:
+            changes["opponent_code"] = True
         if self.formation:
             changes["start"] = env.start.model_copy(update={"formation": self.formation})
         return env.model_copy(update=changes)

@@ -93,7 +93,7 @@ def _function(module: str, function: str) -> Driver:
         sys.path.append(os.getcwd())
     try:
         found = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, TypeError) as error:
         raise OutlapError(f"driver {module}:{function}: cannot be imported: {error}") from None
     return _as_driver(found, f"driver {module}:{function}:")
 

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from outlap.drivers.vehicle_actions import speed_action, steer_action
+from outlap.errors import OutlapError
+
+LEAST_BEAMS = 9
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,8 @@ class FollowTheGap:
 
     def _free_ways(self, scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Directions [rad] (m,) in the front half, and how far the car can go in each before it touches: (n, m)."""
+        if scan.shape[1] < LEAST_BEAMS:
+            raise OutlapError(f"driver {self.name}: has {scan.shape[1]} beams; must have {LEAST_BEAMS} or more")
         angles = np.linspace(-0.5 * self.field_of_view, 0.5 * self.field_of_view, scan.shape[1])
         step = max(1, round(math.radians(2.0) / (angles[1] - angles[0])))
         ahead = np.flatnonzero(np.abs(angles) <= 0.5 * math.pi)[::step]

@@ -38,6 +38,7 @@ class Race:
     stall_mark: np.ndarray = field(init=False)  # distance at that time [m]
     stalled: np.ndarray = field(init=False)  # bool: this step ended the car's race for want of progress
     ahead: np.ndarray = field(init=False)  # bool (worlds, cars, cars): whether the first car is ahead of the second
+    racing: np.ndarray = field(init=False)  # bool: on the track
     places_gained: np.ndarray = field(init=False)  # in this step
     places_lost: np.ndarray = field(init=False)
     rewards: np.ndarray = field(init=False)  # of this step, 0 after a reset
@@ -55,6 +56,7 @@ class Race:
         self.stall_mark = np.zeros(everyone)
         self.stalled = np.zeros(everyone, bool)
         self.ahead = np.zeros((*everyone, everyone[1]), bool)
+        self.racing = np.ones(everyone, bool)
         self.places_gained = np.zeros(everyone, np.int64)
         self.places_lost = np.zeros(everyone, np.int64)
         self.rewards = np.zeros(everyone)
@@ -106,6 +108,7 @@ class Race:
             array[which] = distance
         self.farthest_time[which] = 0.0
         self.ahead[which] = distance[:, :, None] > distance[:, None]
+        self.racing[which] = True
         self.places_gained[which] = 0
         self.places_lost[which] = 0
         self.rewards[which] = 0.0
@@ -134,6 +137,9 @@ class Race:
         lead = self.distance[:, :, None] - self.distance[:, None]
         margin = self.worlds.params[:, None, :, LENGTH]
         racing = self.worlds.contact != REMOVED
+        back = racing & ~self.racing  # put back on the track: whoever went by meanwhile has overtaken nobody
+        np.copyto(self.ahead, lead > 0.0, where=back[:, :, None] | back[:, None])
+        self.racing[:] = racing
         both = racing[:, :, None] & racing[:, None]
         gained = ~self.ahead & (lead > margin) & both
         lost = self.ahead & (lead < -margin) & both

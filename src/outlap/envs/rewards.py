@@ -98,8 +98,13 @@ def speed_change(race: Race, car: int, config: RewardConfig) -> np.ndarray:
 
 
 def overtake(race: Race, car: int, config: RewardConfig) -> np.ndarray:
-    """Places gained less places lost."""
-    return (race.places_gained[:, car] - race.places_lost[:, car]).astype(np.float64)
+    """Places gained."""
+    return race.places_gained[:, car].astype(np.float64)
+
+
+def overtaken(race: Race, car: int, config: RewardConfig) -> np.ndarray:
+    """-Places lost."""
+    return -race.places_lost[:, car].astype(np.float64)
 
 
 REWARD_TERMS: dict[str, Callable[[Race, int, RewardConfig], np.ndarray]] = {
@@ -112,6 +117,7 @@ REWARD_TERMS: dict[str, Callable[[Race, int, RewardConfig], np.ndarray]] = {
     "steering_change": steering_change,
     "speed_change": speed_change,
     "overtake": overtake,
+    "overtaken": overtaken,
 }
 
 REWARD_PRESETS: dict[str, dict[str, float]] = {
@@ -123,6 +129,7 @@ REWARD_PRESETS: dict[str, dict[str, float]] = {
         "steering_change": 0.01,
         "speed_change": 0.01,
         "overtake": 1.0,
+        "overtaken": 1.0,
     },
     # The paper's terms with its authors' constants. Their collision penalty could not grow (its
     # maximum was 1, the value it starts from); `collision_max` restores the curriculum that the paper describes.
@@ -134,5 +141,6 @@ REWARD_PRESETS: dict[str, dict[str, float]] = {
         "steering_change": 0.05,
         "speed_change": 0.0,
         "overtake": 20.0,
+        "overtaken": 20.0,
     },
 }
