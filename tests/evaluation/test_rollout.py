@@ -11,6 +11,7 @@ import pytest
 from pandas.testing import assert_frame_equal
 
 from outlap.drivers.centerline_follower import CenterlineFollower
+from outlap.drivers.function import FunctionDriver
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_env import RaceEnv
@@ -279,3 +280,20 @@ def test_a_policy_is_not_shown_what_it_was_not_trained_on(policy):
     task = SLIPPERY.model_copy(update={"beams": 20})
     with pytest.raises(OutlapError, match="trained on 12 numbers of 'scan' and would be shown 20"):
         evaluate(policy, task, [LARGE], episodes=1, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (np.full((2, 2), np.nan), r"driver broken: gave the action \[nan, nan\]; must be finite"),
+        (np.zeros((2, 3)), r"driver broken: gave actions of shape \(2, 3\); must be \(2, 2\)"),
+        ([["a"]], r"driver broken: gave \[\['a'\]\]; must be numbers \(2, 2\)"),
+    ],
+)
+def test_a_driver_that_gives_nonsense_is_named(answer, message) -> None:
+    def broken(observation):
+        return answer
+
+    track = ring()
+    with pytest.raises(OutlapError, match=message):
+        evaluate(FunctionDriver(broken, "broken", ("frenet",)), standing_starts(RaceConfig(), [track]), [track], 2, 0)

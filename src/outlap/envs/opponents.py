@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from outlap.config import Number, bounds
-from outlap.drivers.driver import Driver
+from outlap.drivers.driver import Driver, ask
 from outlap.drivers.mlp import DriverStack, MLPDriver
 from outlap.envs.observations import OBSERVATION_TERMS, observe
 from outlap.envs.race import Race
@@ -111,16 +111,7 @@ class Opponents:
                 continue
             driver.begin(self._begins.ravel())
             flat = {name: value.reshape(worlds * cars, -1) for name, value in observation.items()}
-            chosen = np.asarray(driver.act(flat))
-            if chosen.shape != (worlds * cars, 2):
-                raise OutlapError(
-                    f"driver {driver.name}: gave actions of shape {chosen.shape}; must be {(worlds * cars, 2)}"
-                )
-            out[mine] = chosen.reshape(worlds, cars, 2)[mine]
-        if not np.isfinite(out).all():
-            wrong = np.argwhere(~np.isfinite(out).all(axis=2))[0]
-            name = self._names[self.number[tuple(wrong)]]
-            raise OutlapError(f"driver {name}: gave the action {out[tuple(wrong)].tolist()}; must be finite")
+            out[mine] = ask(driver, flat, worlds * cars).reshape(worlds, cars, 2)[mine]
         self._begins[:] = False
         if self.noise.any():
             out += self.noise[..., None] * self._normal(2 * cars).reshape(worlds, cars, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from outlap.drivers.driver import Driver
+from outlap.drivers.driver import Driver, ask
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
@@ -26,7 +26,7 @@ def record_lap(driver: Driver, env: RaceConfig, track: Track, seed: int = 0) -> 
     driver.begin(np.ones(1, bool))
     worlds, lap = race.race.worlds, []
     while True:
-        observation, _, terminated, truncated, info = race.step(driver.act(observation))
+        observation, _, terminated, truncated, info = race.step(ask(driver, observation, 1))
         begun = worlds.lap_start[0, EGO]
         if not (np.isnan(begun) or worlds.laps[0, EGO]):
             state = worlds.state[0, EGO]

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from gymnasium.vector import AutoresetMode
 
-from outlap.drivers.driver import Driver
+from outlap.drivers.driver import Driver, ask
 from outlap.drivers.find import find_drivers
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race import EGO
@@ -174,7 +174,7 @@ def _race(
     steps = 0
     while len(rows) < len(seeds):
         env.training_steps = CURRICULA_OVER
-        observation, rewards, terminated, truncated, info = env.step(driver.act(observation))
+        observation, rewards, terminated, truncated, info = env.step(ask(driver, observation, worlds))
         steps += int((racing != IDLE).sum())
         over = terminated | truncated
         for world in np.flatnonzero(over & (racing != IDLE)).tolist():
