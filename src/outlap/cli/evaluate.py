@@ -158,6 +158,7 @@ def find_subject(name: str, *, deterministic: bool = True, seed: int = 0) -> tup
 
     Raises OutlapError for a name that stands for nobody, or for many.
     """
+    from outlap.evaluation.rollout import made_for
     from outlap.training.ppo import PPOConfig
     from outlap.training.run import load_run
 
@@ -169,14 +170,7 @@ def find_subject(name: str, *, deterministic: bool = True, seed: int = 0) -> tup
     if len(drivers) > 1:
         names = ", ".join(driver.name for driver in drivers)
         raise OutlapError(f"{name}: is a population; name one of its drivers, {name}/NAME: {names}")
-    beams = getattr(drivers[0], "beams", None)
-    if beams is not None:
-        env = env.model_copy(update={"beams": beams})
-    speeds = getattr(drivers[0], "speeds", None)
-    if speeds is not None:  # an opponent drives the car that it was trained in
-        vehicle = env.vehicle.model_copy(update={"v_max": speeds[1]})
-        env = env.model_copy(update={"vehicle": vehicle, "speed_range": speeds})
-    return drivers[0], env, None
+    return drivers[0], made_for(drivers[0], env), None
 
 
 def evaluate_into(

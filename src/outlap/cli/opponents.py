@@ -1,4 +1,4 @@
-"""`outlap opponents train | verify | list`."""
+"""`outlap opponents train | verify | list | record`."""
 
 from __future__ import annotations
 

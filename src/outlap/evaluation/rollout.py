@@ -73,6 +73,16 @@ def standing_starts(
     return env.model_copy(update=changes)
 
 
+def made_for(driver: Driver, env: RaceConfig) -> RaceConfig:
+    """A task with the scanner and the car that a driver was trained with, as far as it says so."""
+    changes: dict[str, Any] = {}
+    if (beams := getattr(driver, "beams", None)) is not None:
+        changes["beams"] = beams
+    if (speeds := getattr(driver, "speeds", None)) is not None:
+        changes |= {"vehicle": env.vehicle.model_copy(update={"v_max": speeds[1]}), "speed_range": speeds}
+    return env.model_copy(update=changes)
+
+
 def episode_seeds(seed: int, track: str, episodes: int) -> np.ndarray:
     """The seeds of a track's episodes: int64 (episodes,), the first ones the same however many there are."""
     key = zlib.crc32(track.encode())
@@ -214,8 +224,10 @@ def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[s
     settings["augment_tracks"] = False  # the track that was named, not one of its variants
     settings["observation"] = driver.observation_terms
     settings["scale_observations"] = driver.scale_observations
-    names = config.opponents if config.num_cars > 1 else ()
-    others = find_drivers(names, config.field_of_view, config.opponent_split, config.opponent_code)
+    others: list[Driver] = []
+    if config.num_cars > 1:
+        others = find_drivers(config.opponents, config.field_of_view, config.opponent_split, config.opponent_code)
+        settings["opponents"] = others  # found once, and not by the environment again
     if not any("scan" in each.observation_terms for each in (driver, *others)):
         settings["beams"] = 0  # nobody looks
     return settings

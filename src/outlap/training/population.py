@@ -26,7 +26,7 @@ from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
-from outlap.evaluation.rollout import evaluate, standing_starts
+from outlap.evaluation.rollout import evaluate, made_for, standing_starts
 from outlap.track.track import Track
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
@@ -123,10 +123,7 @@ def train_population(
 
 def verify(driver: MLPDriver, env: RaceConfig, track: Track, laps: int, starts: int, seed: int = 0) -> pd.DataFrame:
     """Rows of an opponent's runs alone, from standing starts anywhere on the lap until its laps are done."""
-    vehicle = env.vehicle.model_copy(update={"v_max": driver.speeds[1]})
-    beams = env.beams if driver.beams is None else driver.beams
-    changes = {"num_cars": 1, "vehicle": vehicle, "speed_range": driver.speeds, "beams": beams}
-    alone = env.model_copy(update=changes)
+    alone = made_for(driver, env.model_copy(update={"num_cars": 1}))
     return evaluate(driver, standing_starts(alone, [track], laps), [track], starts, seed)
 
 
