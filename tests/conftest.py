@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numba
@@ -13,6 +14,15 @@ import pytest
 def one_thread() -> None:
     """A handful of worlds is no work for two threads; tests of threading set a number of their own."""
     numba.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_cache(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Iterator[None]:
+    """Lines are planned once for all tests, and the user's cache is left alone."""
+    base = tmp_path_factory.getbasetemp()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OUTLAP_CACHE", str((base if worker_id == "master" else base.parent) / "outlap-cache"))
+        yield
 
 
 @pytest.fixture(scope="session")

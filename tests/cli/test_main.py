@@ -72,7 +72,7 @@ def outlap(*words: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ([], "outlap: error: no command; choose from tracks, train"),
+        ([], "outlap: error: no command; choose from tracks, raceline, train"),
         (["trcks"], "outlap: error: 'trcks' is not a command; did you mean 'tracks'?"),
         (["tracks"], "outlap: error: tracks needs a command; choose from list, show"),
         (["tracks", "lst"], "outlap: error: 'tracks lst' is not a command; did you mean 'tracks list'?"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pandas as pd
@@ -80,6 +81,7 @@ def test_the_seed_is_the_unit() -> None:
             "track": "ring",
             "outcome": ["crash", "timeout", "crash", "crash", "timeout", "timeout"],
             "mean_speed_mps": [1.0, 3.0, 2.0, 2.0, 4.0, 4.0],
+            "lap_time_ratio": [math.nan, math.nan, 1.1, math.nan, 1.3, 1.3],
             "progress_m": 1.0,
         }
     )
@@ -89,6 +91,8 @@ def test_the_seed_is_the_unit() -> None:
     assert abc["crash_rate"]["mean"] == 0.5
     assert abc["crash_rate"]["sd"] == pytest.approx(0.5**0.5)  # of the two seeds: 1 and 0
     assert abc["mean_speed_mps"]["mean"] == 3.0
+    assert abc["lap_time_ratio"]["mean"] == pytest.approx(1.2)
+    assert summary["before"]["all"]["lap_time_ratio"]["mean"] is None
 
 
 def test_benchmark_rows(capfd: pytest.CaptureFixture[str]) -> None:

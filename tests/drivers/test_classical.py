@@ -19,6 +19,7 @@ from outlap.track import Track
 from outlap.track.generate import BUILTIN_HELD_OUT
 
 SPAN = np.array([[0.4, 0.0, 8.0]], np.float32)  # full lock [rad], slowest, fastest [m/s]
+PLAIN = {"lookahead_time": 0.0, "yaw_rate_gain": 0.0, "understeer": 0.0}  # pursuit and nothing else
 ANGLES = np.linspace(-2.35, 2.35, 109)
 
 
@@ -28,8 +29,8 @@ def line(x, y, speed=3.0) -> np.ndarray:
     return np.stack([x(s), y(s), np.full_like(s, speed)], -1).reshape(1, -1)
 
 
-def pursue(ahead: np.ndarray, forward: float = 2.0, **settings: float) -> np.ndarray:
-    vel = np.array([[forward, 0.0, 0.0]])
+def pursue(ahead: np.ndarray, forward: float = 2.0, leftward=0.0, yaw_rate=0.0, **settings: float) -> np.ndarray:
+    vel = np.array([[forward, leftward, yaw_rate]])
     return PurePursuit(**settings).act({"line_ahead": ahead, "vel": vel, "action_span": SPAN})[0]  # type: ignore[arg-type]
 
 
@@ -41,19 +42,42 @@ def test_on_a_straight_line_it_steers_straight_at_the_lines_speed():
 
 @pytest.mark.parametrize("radius", [-4.0, 3.0])
 def test_on_a_circle_it_steers_the_circles_curvature(radius):
-    steer, _ = pursue(line(lambda s: radius * np.sin(s / radius), lambda s: radius * (1 - np.cos(s / radius))))
+    arc = line(lambda s: radius * np.sin(s / radius), lambda s: radius * (1 - np.cos(s / radius)))
+    steer, _ = pursue(arc, yaw_rate=2.0 / radius, understeer=0.0)
     assert steer == pytest.approx(math.atan(0.33 / radius) / 0.4, rel=0.02)
+
+
+def test_a_car_that_slides_along_the_line_steers_straight():
+    """Its nose points 0.2 rad to the left of the line, and it moves along it."""
+    ahead = line(lambda s: s * math.cos(0.2), lambda s: -s * math.sin(0.2))
+    steer, _ = pursue(ahead, forward=5.0 * math.cos(0.2), leftward=-5.0 * math.sin(0.2))
+    assert steer == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_tail_that_comes_round_is_caught():
+    """On a straight, turning to the left: it steers to the right, and the more the faster it turns."""
+    straight = line(lambda s: s, lambda s: 0.0 * s)
+    slow, fast = (pursue(straight, forward=6.0, yaw_rate=rate)[0] for rate in (0.5, 1.0))
+    assert fast < slow < 0.0
+
+
+def test_far_from_the_line_it_looks_farther_ahead():
+    """1.3 m beside a straight: over 4 m, where 0.4 m would have it turn across."""
+    far = line(lambda s: s, lambda s: 0.0 * s + 1.3)
+    steer, _ = pursue(far, 1.0, **PLAIN)
+    distance = 0.4 + 4.0 * (1.3 - 0.3)
+    assert math.tan(0.4 * steer) / 0.33 == pytest.approx(2 * 1.3 / distance**2, rel=0.02)
 
 
 def test_it_turns_towards_a_line_beside_it_and_less_so_the_faster_it_is():
     beside = line(lambda s: s, lambda s: 0.0 * s + 0.3)
-    slow, fast = pursue(beside, 0.0)[0], pursue(beside, 6.0)[0]
+    slow, fast = (pursue(beside, speed, yaw_rate_gain=0.0)[0] for speed in (0.0, 6.0))
     assert slow > 2.0 * fast > 0.0
 
 
 def test_the_arc_goes_through_the_point_at_the_lookahead_distance():
     """Of the circle through the car, tangent to its heading, and that point: κ = 2 y / d²."""
-    steer, _ = pursue(line(lambda s: s, lambda s: 0.0 * s + 0.3), 2.0, lookahead=1.0, lookahead_time=0.0)
+    steer, _ = pursue(line(lambda s: s, lambda s: 0.0 * s + 0.3), 2.0, lookahead=1.0, **PLAIN)
     assert math.tan(0.4 * steer) / 0.33 == pytest.approx(2 * 0.3 / 1.0**2, rel=0.1)
 
 

@@ -224,7 +224,7 @@ def test_gymnasiums_statistics_agree_with_ours(ellipse):
 
 
 def test_real_circuits_by_name(real_tracks, monkeypatch):
-    """As in the README: tracks=["IMS"]. The reference speed is that of the racing line in its file."""
+    """As in the README: tracks=["IMS"]. Pure pursuit is shown the racing line in its file, with its speeds."""
     monkeypatch.setenv("OUTLAP_TRACKS", str(real_tracks))
     env = gym.make_vec(
         NAME,
@@ -234,7 +234,6 @@ def test_real_circuits_by_name(real_tracks, monkeypatch):
         num_cars=2,
         beams=108,
         control_interval=4,
-        reward="paper",
     )
     _, info = env.reset(seed=0)
     assert set(info["track"]) == {"IMS", "Spielberg"}

@@ -11,21 +11,23 @@ from scipy import stats
 
 from outlap.evaluation.metrics import summarise
 
-# track, outcome, contact, opponents' crashes, overtakes, places lost, laps, lap time, speed, progress, steps, return
+# track, outcome, contact, opponents' crashes, overtakes, places lost, error of the least lap, laps, lap time, ratio,
+# speed, progress, steps, return
+NAN = math.nan
 ROWS = [
-    ("A", "crash", "car", 1, 2, 1, 0, math.nan, 5.0, 10.0, 50, -1.0),
-    ("A", "finished", "", 0, 1, 0, 3, 60.0, 7.0, 1200.0, 4500, 9.0),
-    ("A", "timeout", "", 2, 0, 0, 1, 80.0, 6.0, 700.0, 6000, 4.0),
-    ("B", "stalled", "", 0, 0, 4, 0, math.nan, 0.0, 0.0, 75, 0.0),
+    ("A", "crash", "car", 1, 2, 1, NAN, 0, NAN, NAN, 5.0, 10.0, 50, -1.0),
+    ("A", "finished", "", 0, 1, 0, 0.002, 3, 60.0, 1.1, 7.0, 1200.0, 4500, 9.0),
+    ("A", "timeout", "", 2, 0, 0, 0.002, 1, 80.0, 1.5, 6.0, 700.0, 6000, 4.0),
+    ("B", "stalled", "", 0, 0, 4, NAN, 0, NAN, NAN, 0.0, 0.0, 75, 0.0),
 ]
 NAMES = [
-    "track", "outcome", "contact", "opponent_crashes", "overtakes", "places_lost", "completed_laps", "lap_time_s",
-    "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
+    "track", "outcome", "contact", "opponent_crashes", "overtakes", "places_lost", "min_lap_error", "completed_laps",
+    "lap_time_s", "lap_time_ratio", "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
 ]  # fmt: skip
 KEYS = {
     "episodes", "crash_rate", "crash_rate_low", "crash_rate_high", "overtakes", "places_lost", "outcomes",
-    "contacts", "opponent_crashes",
-    "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
+    "contacts", "opponent_crashes", "min_lap_error",
+    "completed_laps", "lap_time_s", "lap_time_ratio", "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
 }  # fmt: skip
 
 
@@ -39,7 +41,7 @@ def test_every_summary_has_exactly_the_promised_keys(summary):
     assert list(summary["tracks"]) == ["A", "B"]
     for each in (summary["all"], *summary["tracks"].values()):
         assert set(each) == KEYS
-        for name in NAMES[6:]:
+        for name in NAMES[7:]:
             assert set(each[name]) == {"mean", "sd", "low", "high"}
 
 

@@ -148,7 +148,7 @@ def _print(console: Console, data: Mapping[str, Any]) -> None:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, title="before and after adapting")
-    for heading in ("method", "track", "crash rate [%]", "speed [m/s]", "progress [m]"):
+    for heading in ("method", "track", "crash rate [%]", "speed [m/s]", "lap / least", "progress [m]"):
         table.add_column(heading, justify="left" if heading in ("method", "track") else "right")
     for method, summary in data.items():
         if method == "folder":
@@ -156,13 +156,16 @@ def _print(console: Console, data: Mapping[str, Any]) -> None:
         for track, each in [*summary["tracks"].items(), ("all", summary["all"])]:
             crashes = _cell(each["crash_rate"], 100.0, 1)
             speed, progress = _cell(each["mean_speed_mps"], 1.0, 2), _cell(each["progress_m"], 1.0, 0)
-            table.add_row(method, track, crashes, speed, progress, end_section=track == "all")
+            ratio = _cell(each["lap_time_ratio"], 1.0, 3)
+            table.add_row(method, track, crashes, speed, ratio, progress, end_section=track == "all")
     console.print(table)
     console.print("mean over adaptation seeds [95 % interval]", style="dim")
     console.print(f"results: {data['folder']}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _cell(value: Mapping[str, float], scale: float, digits: int) -> str:
+    if value["mean"] is None:  # nobody came so far
+        return "-"
     mean = f"{scale * value['mean']:.{digits}f}"
     if value["low"] is None:  # one seed has no interval
         return mean

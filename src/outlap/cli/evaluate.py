@@ -69,6 +69,9 @@ class Evaluate:
     opponent_split: Literal["train", "held_out"] = "held_out"
     """The half of a population that opponents are drawn from."""
 
+    racing_line: Literal["track", "min-curvature", "min-time"] | None = None
+    """That pure pursuit follows, in place of the run's: the track's own, or one planned for the car."""
+
     formation: Literal["queue", "behind", "grid", "scattered"] | None = None
     """In which the cars start, in place of the run's; behind: the driver's car is the last."""
 
@@ -99,7 +102,7 @@ class Evaluate:
             raise OutlapError(f"--stochastic is for a trained run; {self.driver} draws nothing")
         driver, trained_env, run = find_subject(self.driver, deterministic=not self.stochastic, seed=self.seed)
         tracks = load_tracks(self.tracks or held_out_tracks(run))
-        env = self._with_opponents(with_top_speed(trained_env, self.v_max))
+        env = self._as_asked(with_top_speed(trained_env, self.v_max))
         env = standing_starts(env, tracks, self.laps, self.time_limit)
         home = run.folder if run else Path("runs") / driver.name
         folder = self.out or unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
@@ -131,7 +134,7 @@ class Evaluate:
         if self.laps == 0 and self.time_limit is None:
             raise OutlapError("--laps is 0; must be 1 or more, or be given with a --time-limit")
 
-    def _with_opponents(self, env: RaceConfig) -> RaceConfig:
+    def _as_asked(self, env: RaceConfig) -> RaceConfig:
         changes: dict[str, Any] = {"opponent_split": self.opponent_split}
         if self.num_cars is not None:
             changes["num_cars"] = self.num_cars
@@ -139,6 +142,8 @@ class Evaluate:
             changes |= {"num_cars": max(2, env.num_cars), **changes, "opponents": self.opponents}
         if self.opponent_code:
             changes["opponent_code"] = True
+        if self.racing_line is not None:
+            changes["racing_line"] = self.racing_line
         if self.formation:
             changes["start"] = env.start.model_copy(update={"formation": self.formation})
         return env.model_copy(update=changes)
@@ -250,7 +255,7 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
         f"{data['driver']}: {each} episodes on each track, {data['all']['episodes']} in all",
         highlight=False, markup=False,
     )  # fmt: skip
-    for columns in (DRIVING, RACING):
+    for columns in (DRIVING, RACING, EPISODES):
         console.print()
         console.print(_table(data, columns))
     console.print()
@@ -258,6 +263,12 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
         "mean ± sd over episodes, [95 % interval of the mean]",
         style="dim", highlight=False, markup=False,
     )  # fmt: skip
+    if (error := data["all"]["min_lap_error"]) is not None:
+        exact = f", found to {100.0 * error:.2f} % at worst" if error else ""
+        console.print(
+            f"lap / least: lap time over the minimum-time lap of the same track and vehicle{exact}",
+            style="dim", highlight=False, markup=False,
+        )  # fmt: skip
     if trained_on:
         console.print(
             f"* trained on {', '.join(trained_on)}: not a result on unseen tracks", highlight=False, markup=False
@@ -265,12 +276,16 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
     console.print(f"results: {data['folder']}", highlight=False, markup=False, soft_wrap=True)
 
 
-DRIVING = ("crash_rate", "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m")
-RACING = ("crashes", "overtakes", "places_lost", "episode_steps", "episode_return")
+DRIVING = ("crash_rate", "completed_laps", "lap_time_s", "lap_time_ratio", "mean_speed_mps")
+RACING = ("crashes", "overtakes", "places_lost")
+EPISODES = ("progress_m", "episode_steps", "episode_return")
+DIGITS = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "lap_time_ratio": 3, "episode_return": 1}
+DIGITS = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "lap_time_ratio": 3, "episode_return": 1}
 HEADINGS = {
     "crash_rate": "crash rate",
     "completed_laps": "laps",
     "lap_time_s": "lap time [s]",
+    "lap_time_ratio": "lap / least",
     "mean_speed_mps": "speed [m/s]",
     "progress_m": "progress [m]",
     "crashes": "crashes",
@@ -311,7 +326,7 @@ def _cell(summary: Mapping[str, Any], column: str) -> str:
         return str(value)
     if value["mean"] is None:
         return "-"
-    digits = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "episode_return": 1}.get(column, 2)
+    digits = DIGITS.get(column, 2)
     if value["sd"] is None:
         return f"{value['mean']:.{digits}f}"
     return (

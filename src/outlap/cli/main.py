@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -49,6 +50,7 @@ COMMANDS = (
     Entry("tracks generate", "outlap.cli.tracks:GenerateTrack", "make a random closed circuit from a seed"),
     Entry("tracks import", "outlap.cli.tracks:ImportTrack", "make an F1TENTH map folder of a centreline csv"),
     Entry("tracks download", "outlap.cli.tracks:DownloadTracks", "get circuits from the official archive"),
+    Entry("raceline", "outlap.cli.raceline:PlanRaceline", "plan the fastest line around a track for a car"),
     Entry("train ppo", "outlap.cli.train:TrainPPO", "train a policy with PPO and domain randomization"),
     Entry("train mql", "outlap.cli.train:TrainMQL", "meta-train a policy with Meta-Q-Learning"),
     Entry("opponents train", "outlap.cli.opponents:TrainOpponents", "train a population of opponents"),
@@ -79,6 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    _show_log()
     prog = "outlap"
     try:
         text = _information(arguments)
@@ -98,6 +101,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         # `| head` has seen enough; nor may the interpreter complain when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OUTPUT_CLOSED
+
+
+def _show_log() -> None:
+    """What outlap logs goes to standard error: what takes long, and what was left out."""
+    log = logging.getLogger("outlap")
+    log.setLevel(logging.INFO)
+    for handler in log.handlers[:]:  # of a command before in the same process, whose standard error may be closed
+        log.removeHandler(handler)
+    log.addHandler(logging.StreamHandler())
 
 
 def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:

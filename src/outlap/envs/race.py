@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from outlap.envs.racing_line import ReferenceSpeeds
 from outlap.simulator import state as column
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
 from outlap.simulator.collision import FREE, REMOVED
@@ -26,6 +27,7 @@ class Race:
     simulator: Simulator
     nearby_cars: int  # of which the observation term of that name tells
     racing_line: np.ndarray  # float32 (rows of the atlas, 3), see `racing_lines`
+    reference: ReferenceSpeeds | None = None  # for the reward that asks for them
     training_steps: int = 0  # environment steps so far, all worlds together
     actions: np.ndarray = field(init=False)  # (worlds, cars, 2) of this step
     actions_before: np.ndarray = field(init=False)  # of the step before; after a reset equal to `actions`
@@ -101,6 +103,8 @@ class Race:
 
     def begin(self, which: np.ndarray) -> None:
         """Take note of worlds that were just reset."""
+        if self.reference is not None:
+            self.reference.begin(which, self.worlds.track[which], self.worlds.params[which])
         self.actions[which] = 0.0
         self.actions_before[which] = 0.0
         distance = self.distance[which]

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, field_validator
 
 from outlap.config import Number, bounded
+from outlap.envs.racing_line import RacingLine
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.starts import StartConfig
 from outlap.envs.terminations import TerminationConfig
@@ -47,6 +48,7 @@ class RaceConfig(SimulatorConfig):
     actuators: ActuatorParams = ActuatorParams()
     lidar: LidarParams = LidarParams()
     observation: tuple[str, ...] = PAPER_OBSERVATION  # terms, see envs.observations
+    racing_line: RacingLine = "track"  # to which `line_ahead` leads, see envs.racing_line
     nearby_cars: int = Field(default=3, ge=1)  # of which the term of that name tells
     scale_observations: bool = False  # divide every term by its declared scale
     reward: RewardConfig = RewardConfig()

@@ -18,7 +18,7 @@ from outlap.envs.observations import observation_space, observe
 from outlap.envs.opponents import Opponents
 from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.racing_line import racing_lines
+from outlap.envs.racing_line import ReferenceSpeeds, racing_lines
 from outlap.envs.rewards import REWARD_TERMS
 from outlap.envs.starts import draw_starts
 from outlap.envs.tasks import TaskSet, load_tracks, track_name
@@ -99,8 +99,12 @@ class RaceVectorEnv(VectorEnv):
         self.tasks = TaskSet(loaded, self.config.vehicle, self.config.actuators, self.config.lidar)
         simulator = Simulator(loaded, num_envs, self.config.num_cars, self.config, self.tasks.max_delay)
         typical = np.mean(parameter_bounds(self.config.vehicle), axis=0)
-        self.race = Race(simulator, self.config.nearby_cars, racing_lines(loaded, simulator.atlas, typical))
+        line = racing_lines(loaded, simulator.atlas, typical, self.config.racing_line)
         self._weights = self.config.reward.resolved()
+        reference = None
+        if "velocity_matching" in self._weights:
+            reference = ReferenceSpeeds(loaded, simulator.atlas, typical, num_envs, self.config.num_cars)
+        self.race = Race(simulator, self.config.nearby_cars, line, reference)
         interval = self.config.control_interval * self.config.timestep
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": [], "render_fps": round(1 / interval)}
 

@@ -1,55 +1,107 @@
-"""The line to race on each track, and the speed to have on it: the track's raceline, or else its centreline."""
+"""The line to race on each track, and the speed to have on it."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
+from outlap.planning.kept import kept_line
+from outlap.planning.limits import Limits
+from outlap.planning.path import Path
+from outlap.planning.speed_profile import speed_profile, speed_profiles
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
-from outlap.simulator.vehicle import A_MAX, MU, V_MAX
+from outlap.simulator.vehicle import A_MAX, MU, V_MAX, V_SWITCH
 from outlap.track import centerline
 from outlap.track.centerline import CURVATURE
 from outlap.track.track import Track
 
-GRAVITY = 9.81  # [m/s²]
-LATERAL_SHARE = 0.8  # of the grip that a corner may ask for
+RacingLine = Literal["track", "min-curvature", "min-time"]
+"""`track`: the track's own raceline, with its speeds, or else its centreline. Others are planned, see `planning`."""
+
+GRIP_SHARE = 0.8  # that a car on the centreline, which is nobody's racing line, asks for
+PROFILE_SPACING = 0.1  # [m] of the points at which a car's own speeds are found
 LINE_X, LINE_Y, LINE_SPEED = range(3)  # columns
 
 
-def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray) -> np.ndarray:
+def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, choice: RacingLine) -> np.ndarray:
     """The racing line beside every row of the atlas: float32 (rows, 3) x [m], y [m], speed [m/s].
 
-    The track's raceline, with its speed column, at the arc lengths of the centreline beside which its points lie. A
-    track without one gets the centreline, and the speed at which its curvature asks for LATERAL_SHARE of the grip,
-    braking and accelerating within a_max.
+    Points of a line are at the arc lengths of the centreline beside which they lie.
 
     Args:
-        params: (N_PARAMS,) of a typical car: its mu, a_max and v_max count where there is no raceline.
+        params: (N_PARAMS,) of a typical car, for which lines are planned.
+        choice: which line.
+
+    Raises OutlapError for a track on which none can be planned.
     """
+    limits = Limits.of_row(params)
     out = np.empty((len(atlas.line), 3), np.float32)
     for number, track in enumerate(tracks):
         first, rows = atlas.index[number, FIRST_ROW], atlas.index[number, ROWS]
-        spacing, length = atlas.frame[number, SPACING], track.centerline.length
-        here, line = out[first : first + rows], track.raceline
-        if line is not None:
-            at, _ = track.centerline.to_frenet(line.x, line.y)
-            for column, values in ((LINE_X, line.x), (LINE_Y, line.y), (LINE_SPEED, line.speed)):
-                here[:, column] = np.interp(np.arange(rows) * spacing, at, values, period=length)
-        else:
+        spacing, here = atlas.frame[number, SPACING], out[first : first + rows]
+        if choice == "track" and track.raceline is None:
             middle = atlas.line[first : first + rows]
             here[:, [LINE_X, LINE_Y]] = middle[:, [centerline.X, centerline.Y]]
-            here[:, LINE_SPEED] = _friction_limited(middle[:, CURVATURE], spacing, params)
+            here[:, LINE_SPEED] = speed_profile(middle[:, CURVATURE], spacing, limits, GRIP_SHARE * limits.mu)
+            continue
+        line = track.raceline if choice == "track" else kept_line(track, limits, choice).raceline
+        assert line is not None
+        at, _ = track.centerline.to_frenet(line.x, line.y)
+        for column, values in ((LINE_X, line.x), (LINE_Y, line.y), (LINE_SPEED, line.speed)):
+            here[:, column] = np.interp(np.arange(rows) * spacing, at, values, period=track.centerline.length)
     return out
 
 
-def _friction_limited(curvature: np.ndarray, spacing: float, params: np.ndarray) -> np.ndarray:
-    """A speed profile around a closed line: cornering limit, then braking backwards and accelerating forwards."""
-    lateral = LATERAL_SHARE * float(params[MU]) * GRAVITY
-    squared = np.minimum(lateral / np.maximum(np.abs(curvature), 1e-6), float(params[V_MAX]) ** 2)
-    gain = 2.0 * min(float(params[A_MAX]), lateral) * spacing
-    for order in (range(2 * len(squared), 0, -1), range(2 * len(squared))):
-        before = order[0] % len(squared)
-        for index in order:
-            i = index % len(squared)
-            squared[i] = min(squared[i], squared[before] + gain)
-            before = i
-    return np.sqrt(squared)
+class ReferenceSpeeds:
+    """The fastest speed of every car, by its own limits, all along the minimum-time line of the track that it is on.
+
+    The line is that of the typical car: with a car's own line its lap would be faster by a few parts in a thousand.
+    """
+
+    def __init__(self, tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, worlds: int, cars: int) -> None:
+        """Plan a line on each track, or take it from those that are kept.
+
+        Args:
+            tracks, atlas: see `racing_lines`.
+            params: (N_PARAMS,) of a typical car.
+            worlds, cars: how many there are.
+
+        Raises OutlapError for a track on which none can be planned.
+        """
+        limits = Limits.of_row(params)
+        self._lines = [kept_line(track, limits).path.resampled(PROFILE_SPACING) for track in tracks]
+        rows = atlas.index[:, ROWS]
+        self._beside = [
+            _points_beside(track, line, int(count))
+            for track, line, count in zip(tracks, self._lines, rows, strict=True)
+        ]
+        self._first_row = atlas.index[:, FIRST_ROW]
+        self._speed = np.zeros((worlds, cars, int(rows.max())), np.float32)
+
+    def begin(self, which: np.ndarray, track: np.ndarray, params: np.ndarray) -> None:
+        """Take note of worlds (n,) that begin an episode, on tracks (n,), with cars (n, cars, N_PARAMS)."""
+        cars = params.shape[1]
+        motors = params[..., [A_MAX, A_MAX, V_MAX, V_SWITCH]]
+        for number in np.unique(track):
+            here = np.flatnonzero(track == number)
+            line, beside = self._lines[number], self._beside[number]
+            mu = params[here][..., MU].reshape(-1, 1)
+            speeds = speed_profiles(line.curvature, line.spacing, motors[here].reshape(-1, 4), mu)
+            self._speed[which[here], :, : len(beside)] = speeds[:, beside].reshape(len(here), cars, -1)
+
+    def at(self, car: int, track: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """The speeds [m/s] of a car of every world (worlds,) beside rows (worlds,) of the atlas."""
+        return self._speed[np.arange(len(rows)), car, rows - self._first_row[track]]
+
+
+def _points_beside(track: Track, line: Path, rows: int) -> np.ndarray:
+    """The point of a line that lies beside each row of a centreline's table: (rows,)."""
+    at, _ = track.centerline.to_frenet(*line.points.T)
+    order = np.argsort(at, kind="stable")
+    s = np.arange(rows) * (track.centerline.length / rows)
+    after = np.searchsorted(at[order], s) % len(order)
+    before = after - 1
+    length = track.centerline.length
+    gap_after, gap_before = (at[order[after]] - s) % length, (s - at[order[before]]) % length
+    return order[np.where(gap_after < gap_before, after, before)]

@@ -13,8 +13,6 @@ from pydantic import Field, field_validator, model_validator
 
 from outlap.config import Config
 from outlap.envs.race import Race
-from outlap.envs.racing_line import LINE_SPEED
-from outlap.simulator.vehicle import V_MAX
 
 
 class RewardConfig(Config):
@@ -79,9 +77,9 @@ def stall(race: Race, car: int, config: RewardConfig) -> np.ndarray:
 
 
 def velocity_matching(race: Race, car: int, config: RewardConfig) -> np.ndarray:
-    """-(v - v_ref)^2 w(t) [m^2/s^2]: w falls over training from 1 to 0 as a sigmoid."""
-    rows = race.line_rows(car, np.zeros(1))[:, 0]
-    reference = np.minimum(race.racing_line[rows, LINE_SPEED], race.worlds.params[:, car, V_MAX])
+    """-(v - v_ref)^2 w(t) [m^2/s^2]: v_ref on the minimum-time line; w falls over training from 1 to 0 as a sigmoid."""
+    assert race.reference is not None  # the environment has it where this term counts
+    reference = race.reference.at(car, race.worlds.track, race.line_rows(car, np.zeros(1))[:, 0])
     x = (race.training_steps - config.velocity_step) / config.velocity_width
     weight = 0.5 * (1.0 - np.tanh(0.5 * x))
     return -weight * (race.speed[:, car] - reference) ** 2

@@ -13,7 +13,7 @@ from outlap.evaluation.statistics import estimate_mean, wilson_interval
 
 OUTCOMES = (CRASH, FINISHED, TIMEOUT, STALLED)
 MEANS = (
-    "completed_laps", "lap_time_s", "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
+    "completed_laps", "lap_time_s", "lap_time_ratio", "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
 )  # fmt: skip
 
 
@@ -33,8 +33,8 @@ def summarise(rows: pd.DataFrame) -> dict[str, Any]:
         {"all": summary, "tracks": {name: summary}}. A summary has the number of `episodes`, `crash_rate` with
         its Wilson interval `crash_rate_low` … `crash_rate_high`, the total `overtakes` and `places_lost`, how
         many episodes had which of the `outcomes`, with what the ego made `contacts`, how often an opponent crashed
-        (`opponent_crashes`), and for each of MEANS a {mean, sd, low, high} with the 95 %
-        interval of the mean. What is not known is None.
+        (`opponent_crashes`), by what part the least lap times may be too long (`min_lap_error`), and for each of MEANS
+        a {mean, sd, low, high} with the 95 % interval of the mean. What is not known is None.
     """
     tracks = rows.groupby("track", sort=False)  # in the order of the evaluation
     return {"all": _summary(rows), "tracks": {str(name): _summary(group) for name, group in tracks}}
@@ -47,20 +47,21 @@ def summarise_methods(rows: pd.DataFrame) -> dict[str, Any]:
         rows: of episodes, with `method` and `adaptation_seed`.
 
     Returns:
-        method → {"all": …, "tracks": {name: …}}, each with `crash_rate`, `mean_speed_mps` and `progress_m` as
-        {mean, sd, low, high}; `before` has one seed, and no interval.
+        method → {"all": …, "tracks": {name: …}}, each with `crash_rate`, `mean_speed_mps`, `lap_time_ratio` (of the
+        episodes with a lap) and `progress_m` as {mean, sd, low, high}; `before` has one seed, and no interval.
     """
     columns = {name: rows[name].to_numpy() for name in ("method", "track", "adaptation_seed")}
     values = {
         "crash_rate": (rows["outcome"] == CRASH).to_numpy(np.float64),
         "mean_speed_mps": rows["mean_speed_mps"].to_numpy(np.float64),
+        "lap_time_ratio": rows["lap_time_ratio"].to_numpy(np.float64),
         "progress_m": rows["progress_m"].to_numpy(np.float64),
     }
 
     def of(chosen: np.ndarray) -> dict[str, Any]:
         seeds = columns["adaptation_seed"]
         each = [chosen & (seeds == seed) for seed in np.unique(seeds[chosen])]
-        means = {name: np.array([value[one].mean() for one in each]) for name, value in values.items()}
+        means = {name: np.array([_mean_known(value[one]) for one in each]) for name, value in values.items()}
         counts = {"episodes": int(chosen.sum()), "seeds": len(each)}
         return {**counts, **{name: _mean(mean) for name, mean in means.items()}}
 
@@ -71,6 +72,11 @@ def summarise_methods(rows: pd.DataFrame) -> dict[str, Any]:
         by_track = {track: of(mine & (columns["track"] == track)) for track in tracks}
         summary[method] = {"all": of(mine), "tracks": by_track}
     return summary
+
+
+def _mean_known(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def _summary(rows: pd.DataFrame) -> dict[str, Any]:
@@ -89,6 +95,7 @@ def _summary(rows: pd.DataFrame) -> dict[str, Any]:
         "outcomes": outcomes,
         "contacts": {kind: int(np.count_nonzero(rows["contact"] == kind)) for kind in ("wall", "car")},
         "opponent_crashes": int(rows["opponent_crashes"].to_numpy().sum()),
+        "min_lap_error": _or_none(float(np.fmax.reduce(rows["min_lap_error"].to_numpy(np.float64), initial=np.nan))),
         **{name: _mean(rows[name].to_numpy()) for name in MEANS},
     }
 

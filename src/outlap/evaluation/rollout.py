@@ -7,6 +7,7 @@ a number of steps, or to take the first N episodes that end, would favour short 
 
 from __future__ import annotations
 
+import logging
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,12 +26,17 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.tasks import load_tracks
 from outlap.envs.terminations import CRASH, TerminationConfig
 from outlap.errors import OutlapError
+from outlap.planning.limits import Limits
+from outlap.planning.min_laps import min_laps
 from outlap.simulator.vehicle import parameter_bounds, parameter_names
 from outlap.track.track import Track
+
+log = logging.getLogger(__name__)
 
 DEFAULT_WORLDS = 128
 CRAWL = 1.0  # [m/s] mean speed at which the default time limit still allows all laps and the way to the line
 CURRICULA_OVER = 10**12  # training steps: returns are those at the end of every reward curriculum
+VEHICLE = "vehicle"  # in a row while its episode is raced: the ego's parameters
 IDLE = -1  # the episode of a world that has none left
 
 
@@ -98,6 +104,7 @@ def evaluate(
     seed: int,
     num_worlds: int = DEFAULT_WORLDS,
     on_progress: Callable[[EvaluationProgress], None] | None = None,
+    lap_time_ratios: bool = True,
 ) -> pd.DataFrame:
     """Race `driver` in `episodes` episodes on each track.
 
@@ -112,13 +119,17 @@ def evaluate(
         seed: from which that of each episode is made; equal seeds give the same episodes to every driver.
         num_worlds: raced at once; changes the time, and not the rows (those of a stochastic policy excepted).
         on_progress: called after every step.
+        lap_time_ratios: compare laps with the least time in which they can be driven; lines are planned for that once
+            a track, some ten seconds each, where an episode has a lap.
 
     Returns:
         A row an episode, in the order of the tracks and of their seeds: track, episode (its number), seed,
         driver, outcome, terminated, truncated, episode_steps, duration_s, episode_return, last_reward,
-        overtakes, places_lost, completed_laps, lap_time_s (mean of its laps, NaN without one), start_m (arc
-        length), progress_m, mean_speed_mps, contact (what the ego hit: wall, car or nothing), impact_speed_mps (NaN
-        without a crash, relative to what was hit), opponent_crashes, one column for each of the ego's parameters that
+        overtakes, places_lost, completed_laps, lap_time_s (mean of its laps, NaN without one), min_lap_time_s (of the
+        ego's very vehicle on this track, see `planning.min_laps`; NaN in an episode without a lap), lap_time_ratio (of
+        the two before), min_lap_error (part by which the second may be too long), start_m (arc length), progress_m,
+        mean_speed_mps, contact (what the ego hit: wall, car or nothing), impact_speed_mps (NaN without a crash,
+        relative to what was hit), opponent_crashes, one column for each of the ego's parameters that
         is drawn, such as vehicle_mu, the driver of each opponent (opponent_1), and its top speed if that is drawn
         (opponent_1_speed_mps).
 
@@ -139,7 +150,7 @@ def evaluate(
 
     for track in loaded:
         found, track_steps = _race(driver, env_config, track, seeds[track.name], num_worlds, watch)
-        rows += found
+        rows += _with_lap_time_ratios(found, track, env_config, lap_time_ratios)
         steps += track_steps
     return pd.DataFrame(rows)
 
@@ -202,6 +213,7 @@ def _race(
                 **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
                 **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in range(1, config.num_cars)},
                 **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in opponents},
+                VEHICLE: info["vehicle"][world, EGO],
             }
         if over.any():
             again: list[int | None] = [None] * worlds  # an idle world goes on with a stream of its own
@@ -215,6 +227,26 @@ def _race(
             start[over] = env.race.start[over, EGO]
         watch(len(rows), len(rows) + _underway(config, length, start, info, racing != IDLE), steps)
     return [rows[episode] for episode in range(len(seeds))], steps
+
+
+def _with_lap_time_ratios(
+    rows: list[dict[str, Any]], track: Track, config: RaceConfig, wanted: bool
+) -> list[dict[str, Any]]:
+    """The rows of a track with what their laps compare to, in place of the vehicles."""
+    vehicles = [row.pop(VEHICLE) for row in rows]
+    least, error = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    lapped = np.array([row["completed_laps"] > 0 for row in rows])
+    if wanted and lapped.any():
+        try:
+            table = min_laps(track, *map(Limits.of_row, parameter_bounds(config.vehicle)))
+        except OutlapError as problem:  # of the yardstick alone: what was raced is worth no less
+            log.warning("no lap_time_ratio: %s", problem)
+        else:
+            cars = [Limits.of_row(vehicle) for vehicle, lap in zip(vehicles, lapped, strict=True) if lap]
+            least[lapped], error[lapped] = table.of(cars), table.error
+    for row, seconds, part in zip(rows, least.tolist(), error.tolist(), strict=True):
+        row |= {"min_lap_time_s": seconds, "lap_time_ratio": row["lap_time_s"] / seconds, "min_lap_error": part}
+    return rows
 
 
 def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[str, Any]:

@@ -24,10 +24,14 @@ CACHE_VARIABLE = "OUTLAP_CACHE"
 STAGING_PREFIX = ".staging-"
 
 
+def cache_root() -> Path:
+    """`$OUTLAP_CACHE`, or outlap's folder in the platform's user cache; may not exist."""
+    return Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("outlap", appauthor=False)).expanduser()
+
+
 def cache_folder() -> Path:
-    """The folder of cached tracks: `$OUTLAP_CACHE/tracks`, or in the platform's user cache; may not exist."""
-    root = os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("outlap", appauthor=False)
-    return Path(root).expanduser() / "tracks"
+    """The folder of cached tracks, in `cache_root`; may not exist."""
+    return cache_root() / "tracks"
 
 
 @contextmanager

@@ -84,9 +84,7 @@ def write_track(track: Track, folder: str | os.PathLike[str]) -> Path:
     if track.raceline is None:
         raceline_path.unlink(missing_ok=True)
     else:
-        race = track.raceline
-        columns = np.column_stack([race.s, race.x, race.y, race.heading, race.curvature, race.speed, race.acceleration])
-        atomic_write(raceline_path, _csv_text(RACELINE_COLUMNS, columns, "; "))
+        write_raceline_csv(track.raceline, raceline_path)
 
     fields = {
         "image": f"{name}_map.png",
@@ -149,6 +147,17 @@ def read_raceline_csv(path: str | os.PathLike[str]) -> Raceline:
             "it must be greater than in the row before"
         )
     return Raceline(*(_read_only(column) for column in rows.T))
+
+
+def read_number_columns(path: str | os.PathLike[str], columns: tuple[str, ...]) -> np.ndarray:
+    """The numbers (rows, columns) of a csv with these columns, and , or ; between them; comments are left out."""
+    return _read_csv(Path(path), columns)[0]
+
+
+def write_raceline_csv(line: Raceline, path: str | os.PathLike[str]) -> Path:
+    """Write what `read_raceline_csv` reads; returns the path."""
+    columns = np.column_stack([line.s, line.x, line.y, line.heading, line.curvature, line.speed, line.acceleration])
+    return atomic_write(path, _csv_text(RACELINE_COLUMNS, columns, "; "))
 
 
 def find_yaml_files(folder: Path) -> list[Path]:

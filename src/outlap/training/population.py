@@ -124,7 +124,7 @@ def train_population(
 def verify(driver: MLPDriver, env: RaceConfig, track: Track, laps: int, starts: int, seed: int = 0) -> pd.DataFrame:
     """Rows of an opponent's runs alone, from standing starts anywhere on the lap until its laps are done."""
     alone = made_for(driver, env.model_copy(update={"num_cars": 1}))
-    return evaluate(driver, standing_starts(alone, [track], laps), [track], starts, seed)
+    return evaluate(driver, standing_starts(alone, [track], laps), [track], starts, seed, lap_time_ratios=False)
 
 
 def enter(folder: Path, opponent: Opponent, rows: pd.DataFrame, track: str, laps: int, command: str) -> Member | None:

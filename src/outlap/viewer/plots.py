@@ -10,12 +10,15 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D, offset_copy
 
 from outlap.errors import OutlapError
+from outlap.files import replacing
+from outlap.track.raceline import Raceline
 from outlap.track.track import Track
 
 # Okabe and Ito's palette: told apart with any colour vision, and by lightness in a grey print.
@@ -44,7 +47,7 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
     low, high = _view(track)
     map_height = min(8.0, max(2.5, (WIDTH - 0.8) * (high[1] - low[1]) / (high[0] - low[0])))
     figure = Figure(figsize=(WIDTH, map_height + 2.6), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    FigureCanvasAgg(figure)
     map_axes, curvature_axes = figure.subplots(2, 1, height_ratios=(map_height, 1.5))
     marks = np.arange(0.0, centerline.length, _mark_spacing(centerline.length))
 
@@ -64,11 +67,61 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
     if path is not None:
-        ending = Path(path).suffix.lstrip(".").lower()
-        if ending not in canvas.get_supported_filetypes():
-            raise OutlapError(f"{os.fspath(path)}: ending is {ending!r}; must be png, pdf or svg")
-        figure.savefig(path, dpi=200)
+        _save(figure, path)
     return figure
+
+
+def draw_raceline(
+    track: Track, line: Raceline, path: str | os.PathLike[str] | None = None, lap_time: float | None = None
+) -> Figure:
+    """A racing line coloured by speed on the map, and its speed and accelerations along it.
+
+    Args:
+        track: whose map is drawn.
+        line: to draw.
+        path: where to save the figure as well; the ending says in which format (png, pdf, svg).
+        lap_time: for the title [s].
+    """
+    low, high = _view(track)
+    map_height = min(8.0, max(2.5, (WIDTH - 1.4) * (high[1] - low[1]) / (high[0] - low[0])))
+    figure = Figure(figsize=(WIDTH, map_height + 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    map_axes, speed_axes, grip_axes = figure.subplots(3, 1, height_ratios=(map_height, 1.2, 1.2))
+    length = float(line.s[-1] + np.hypot(line.x[0] - line.x[-1], line.y[0] - line.y[-1]))
+    lap = "" if lap_time is None else f", lap {lap_time:.2f} s"
+    map_axes.set_title(f"{track.name}: {length:.0f} m{lap}", loc="left", fontsize=11, fontweight="bold")
+    _draw_walls(map_axes, track)
+    x, y = np.append(line.x, line.x[0]), np.append(line.y, line.y[0])
+    pieces = np.stack([np.column_stack([x[:-1], y[:-1]]), np.column_stack([x[1:], y[1:]])], axis=1)
+    coloured = LineCollection(list(pieces), cmap="viridis", linewidth=1.6, capstyle="round")
+    coloured.set_array(line.speed)
+    map_axes.add_collection(coloured)
+    figure.colorbar(coloured, ax=map_axes, label="speed [m/s]", shrink=0.8)
+    _draw_start(figure, map_axes, track)
+    map_axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    speed_axes.plot(line.s, line.speed, color=BLUE, linewidth=1.0)
+    speed_axes.set(ylabel="speed [m/s]", xlim=(0.0, length), ylim=(0.0, 1.05 * float(line.speed.max())))
+    grip_axes.plot(line.s, line.acceleration, color=BLUE, linewidth=0.9, label="along")
+    across = line.speed**2 * line.curvature
+    grip_axes.plot(line.s, across, color=VERMILLION, linewidth=0.9, linestyle=RACELINE_DASHES, label="across")
+    grip_axes.axhline(0.0, color=INK, linewidth=0.6)
+    grip_axes.set(xlabel="distance along the line [m]", ylabel="acceleration\n[m/s²]", xlim=(0.0, length))
+    grip_axes.legend(loc="upper right", ncols=2, fontsize=7, frameon=False)
+    for axes in (map_axes, speed_axes, grip_axes):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+    if path is not None:
+        _save(figure, path)
+    return figure
+
+
+def _save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure beside its place and rename it. Raises OutlapError for an ending that Matplotlib cannot write."""
+    ending = Path(path).suffix.lstrip(".").lower()
+    if ending not in figure.canvas.get_supported_filetypes():
+        raise OutlapError(f"{os.fspath(path)}: ending is {ending!r}; must be png, pdf or svg")
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=200)
 
 
 def _view(track: Track) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,142 @@
+"""`outlap raceline`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional
+
+from outlap.cli.output import CommandResult
+from outlap.errors import OutlapError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from outlap.planning.limits import Limits
+
+
+@dataclass(frozen=True)
+class PlanRaceline:
+    """Plan the fastest line around a track for a car: an F1TENTH raceline csv, a picture, and its lap time."""
+
+    track: Positional[str]
+    """Name, map folder or centreline csv."""
+
+    vehicle: str = "f1tenth"
+    """The car: a preset (f1tenth, paper), a yaml file of its parameters, or a run folder, whose car it is; of ranges,
+    the middle counts."""
+
+    method: Literal["centerline", "min-curvature", "min-time"] = "min-time"
+    """Of finding the line; its speeds are always the fastest that the car can drive on it."""
+
+    v_max: float | None = None
+    """[m/s] top speed, in place of the car's."""
+
+    mu: float | None = None
+    """Friction, in place of the car's."""
+
+    a_max: float | None = None
+    """[m/s²] with which it accelerates and brakes, in place of the car's."""
+
+    a_brake: float | None = None
+    """[m/s²] with which it brakes, where that differs from --a-max."""
+
+    margin: float | None = None
+    """[m] to keep from the walls, on either side of the car; 0.15 by default, what pure pursuit can do with."""
+
+    friction: Path | None = None
+    """A csv of friction that differs from place to place: s_m, d_m, mu for a grid along and across the centreline."""
+
+    out: Path | None = None
+    """The csv; NAME_raceline.csv here by default. The picture goes beside it, as .png. Older ones are replaced."""
+
+    quiet: FlagCreatePairsOff[bool] = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        import logging
+
+        from outlap.planning.friction import FrictionMap
+        from outlap.planning.plan import DEFAULT_MARGIN, plan_line
+        from outlap.track import Track
+        from outlap.track.map_io import write_raceline_csv
+
+        for flag in ("v_max", "mu", "a_max", "a_brake"):
+            value = getattr(self, flag)
+            if value is not None and not 0.0 < value < float("inf"):
+                raise OutlapError(f"--{flag.replace('_', '-')} is {value}; must be > 0")
+        track = Track.load(self.track)
+        limits = self._limits()
+        friction = None if self.friction is None else FrictionMap.read(self.friction, track.centerline.length)
+        out = self.out or Path(f"{track.name}_raceline.csv")
+        picture = out.with_suffix(".png")
+        if out.is_dir() or out.suffix.lower() != ".csv":
+            raise OutlapError(f"--out is {out}; must be a file that ends in .csv")
+        margin = DEFAULT_MARGIN if self.margin is None else self.margin
+        if self.quiet:
+            logging.getLogger("outlap").setLevel(logging.WARNING)
+        line = plan_line(track, limits, self.method, margin, friction)
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            write_raceline_csv(line.raceline, out)
+            from outlap.viewer.plots import draw_raceline  # Matplotlib: not before it is needed
+
+            draw_raceline(track, line.raceline, picture, line.lap_time)
+        except OSError as error:
+            raise OutlapError(f"--out {out}: cannot be written: {error.strerror}") from error
+        data: dict[str, Any] = {
+            "track": track.name,
+            "method": line.method,
+            "lap_time_s": round(line.lap_time, 4),
+            "length_m": round(line.path.length, 3),
+            "solve_time_s": round(line.solve_time, 2),
+            "min_margin_m": round(line.min_margin, 4),
+            "limits": limits,
+            "raceline": out,
+            "picture": picture,
+        }
+
+        def show(console: Console) -> None:
+            console.print(
+                f"{track.name}, {line.method}: {line.lap_time:.2f} s for {line.path.length:.1f} m, "
+                f"{line.speed.min():.1f} to {line.speed.max():.1f} m/s; at least {line.min_margin:.2f} m from the "
+                f"walls; planned in {line.solve_time:.1f} s",
+                highlight=False, markup=False, soft_wrap=True,
+            )  # fmt: skip
+            for what, path in (("raceline", out), ("picture", picture)):
+                console.print(f"{what}: {path}", highlight=False, markup=False, soft_wrap=True)
+
+        return CommandResult(data, show)
+
+    def _limits(self) -> Limits:
+        from outlap.planning.limits import Limits
+
+        limits = Limits.of(find_vehicle(self.vehicle))
+        changes = {name: value for name in ("v_max", "mu", "a_max") if (value := getattr(self, name)) is not None}
+        if self.a_max is not None or self.a_brake is not None:
+            changes["a_brake"] = self.a_brake or self.a_max
+        return replace(limits, **changes)
+
+
+def find_vehicle(name: str) -> Any:
+    """The car that a preset, a yaml file or a run folder has.
+
+    Raises OutlapError for a name that is none of these.
+    """
+    from outlap.config import load_config
+    from outlap.simulator.vehicle import PRESETS, VehicleParams
+    from outlap.training.run import load_run
+
+    if name in PRESETS:
+        return PRESETS[name]
+    path = Path(name)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return load_config(VehicleParams, path)
+    if (path / "config.yaml").is_file():
+        return load_run(path).config.env.vehicle
+    raise OutlapError(f"--vehicle is {name!r}; must be one of {', '.join(PRESETS)}, a yaml file or a run folder")

@@ -1,0 +1,83 @@
+"""Planned lines that are kept on disk, so that each is planned once on a machine."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import zipfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+import numpy as np
+
+from outlap.files import atomic_write
+from outlap.planning.limits import Limits
+from outlap.planning.path import Path
+from outlap.planning.plan import DEFAULT_MARGIN, Method, PlannedLine, plan_line
+from outlap.track.cache import cache_root
+from outlap.track.track import Track
+
+VERSION = 1  # of the planner: grows with every change that moves a line
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+
+def kept_line(track: Track, limits: Limits, method: Method = "min-time", margin: float = DEFAULT_MARGIN) -> PlannedLine:
+    """`plan_line`, or what it found before for the same walls, centreline, limits and margin."""
+
+    def plan() -> PlannedLine:
+        log.info("%s: planning the %s line; it is kept for the next time", track.name, method)
+        return plan_line(track, limits, method, margin)
+
+    def to_arrays(planned: PlannedLine) -> dict[str, np.ndarray]:
+        numbers = np.array([planned.lap_time, planned.min_margin, planned.solve_time])
+        return {**path_arrays(planned.path), "speed": planned.speed, "numbers": numbers}
+
+    def from_arrays(saved: Mapping[str, np.ndarray]) -> PlannedLine:
+        return PlannedLine(path_of(saved), saved["speed"], method, limits, *saved["numbers"].tolist())
+
+    return kept(["line", track.fingerprint, asdict(limits), method, margin], plan, to_arrays, from_arrays)
+
+
+def kept(
+    key: Any,
+    make: Callable[[], T],
+    to_arrays: Callable[[T], Mapping[str, np.ndarray]],
+    from_arrays: Callable[[Mapping[str, np.ndarray]], T],
+) -> T:
+    """What was made before under a key, or what `make` makes now.
+
+    A cache that cannot be read or written, or holds half a file, costs time and nothing else.
+
+    Args:
+        key: plain data that settles what is made.
+        make: makes it.
+        to_arrays, from_arrays: what of it is written, and how it is read back.
+    """
+    digest = hashlib.sha256(json.dumps([VERSION, key], sort_keys=True).encode()).hexdigest()
+    file = cache_root() / "planning" / f"{digest}.npz"
+    with suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile), np.load(file) as saved:
+        return from_arrays(dict(saved))
+    made = make()
+    buffer = io.BytesIO()
+    np.savez(buffer, **to_arrays(made))  # type: ignore[arg-type]
+    with suppress(OSError):
+        atomic_write(file, buffer.getvalue())
+    return made
+
+
+def path_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
+    """A path as `kept` writes it."""
+    columns = np.column_stack([path.points, path.heading, path.curvature])
+    return {f"{prefix}path": columns, f"{prefix}length": np.array(path.length)}
+
+
+def path_of(saved: Mapping[str, np.ndarray], prefix: str = "") -> Path:
+    """The inverse of `path_arrays`."""
+    columns = saved[f"{prefix}path"]
+    return Path(columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy(), float(saved[f"{prefix}length"]))

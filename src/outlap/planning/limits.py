@@ -1,0 +1,70 @@
+"""What a planned line may ask of a car."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from outlap.errors import OutlapError
+from outlap.simulator import vehicle
+from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+
+GRAVITY = 9.81  # [m/s²]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """A car as a planner sees it: a point with a friction ellipse, a motor, a steering lock and a rectangle for a body.
+
+    The ellipse is (a_x / A_x)² + (a_y / A_y)² ≤ 1 with A_y = mu g across, and along the smaller of mu g and what motor
+    or brakes give.
+    """
+
+    mu: float  # tyre-road friction [-]
+    a_max: float  # with which the motor accelerates [m/s²]
+    a_brake: float  # [m/s²]
+    v_max: float  # [m/s]
+    v_switch: float  # above it, power limits acceleration to a_max v_switch / v [m/s]
+    max_curvature: float  # of the tightest arc at full lock [1/m]
+    steer_rate_max: float  # [rad/s]
+    wheelbase: float  # [m]
+    length: float  # of the body [m]
+    width: float  # [m]
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise OutlapError(f"limits: {field.name} is {value}; it must be a positive number")
+
+    @property
+    def grip(self) -> float:
+        """The acceleration across that friction allows [m/s²]."""
+        return self.mu * GRAVITY
+
+    @classmethod
+    def of_row(cls, row: np.ndarray) -> Limits:
+        """Of a car's parameter row (N_PARAMS,)."""
+        p = np.asarray(row, np.float64)
+        wheelbase = p[vehicle.LF] + p[vehicle.LR]
+        lock = min(p[vehicle.STEER_MAX], -p[vehicle.STEER_MIN])
+        values = {
+            "mu": p[vehicle.MU],
+            "a_max": p[vehicle.A_MAX],
+            "a_brake": p[vehicle.A_MAX],
+            "v_max": p[vehicle.V_MAX],
+            "v_switch": p[vehicle.V_SWITCH],
+            "max_curvature": math.tan(lock) / wheelbase,
+            "steer_rate_max": p[vehicle.STEER_RATE_MAX],
+            "wheelbase": wheelbase,
+            "length": p[vehicle.LENGTH],
+            "width": p[vehicle.WIDTH],
+        }
+        return cls(**{name: float(f"{value:.6g}") for name, value in values.items()})
+
+    @classmethod
+    def of(cls, params: VehicleParams) -> Limits:
+        """Of a car; of the middle of every range."""
+        return cls.of_row(np.mean(parameter_bounds(params), axis=0))
