@@ -195,6 +195,7 @@ def test_the_reference_speed_is_that_of_the_very_car(big_circle):
     env = RaceVectorEnv(6, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0), vehicle={"mu": (0.4, 0.9)})
     env.reset(seed=0)
     race = env.race
+    assert race.reference is not None
     speeds = race.reference.at(0, race.worlds.track, race.line_rows(0, np.zeros(1))[:, 0])
     mu = race.worlds.params[:, 0, MU]
     np.testing.assert_allclose(speeds**2 / mu, (speeds**2 / mu)[0], rtol=2e-2)

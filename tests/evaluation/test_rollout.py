@@ -18,6 +18,7 @@ from outlap.envs.race_env import RaceEnv
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.errors import OutlapError
+from outlap.evaluation import rollout
 from outlap.evaluation.rollout import (
     CURRICULA_OVER,
     drawn_parameters,
@@ -25,6 +26,7 @@ from outlap.evaluation.rollout import (
     evaluate,
     standing_starts,
 )
+from outlap.planning.plan import DEFAULT_MARGIN
 from outlap.simulator.vehicle import ActuatorParams, LidarParams, PacejkaTyre, VehicleParams, parameter_bounds
 from synthetic_tracks import ring
 from untrained_policies import untrained_ppo
@@ -297,3 +299,36 @@ def test_a_driver_that_gives_nonsense_is_named(answer, message) -> None:
     track = ring()
     with pytest.raises(OutlapError, match=message):
         evaluate(FunctionDriver(broken, "broken", ("frenet",)), standing_starts(RaceConfig(), [track]), [track], 2, 0)
+
+
+def test_a_lap_is_compared_with_the_least_time_of_that_very_car(rows):
+    """A car with more grip could lap faster: the same lap is then farther from the limit."""
+    lapped = rows[rows["completed_laps"] > 0]
+    assert len(lapped) > 3
+    np.testing.assert_allclose(lapped["lap_time_ratio"], lapped["lap_time_s"] / lapped["min_lap_time_s"])
+    assert lapped["lap_time_ratio"].min() > 1.0
+    assert np.isnan(rows.loc[rows["completed_laps"] == 0, ["lap_time_ratio", "min_lap_time_s"]].to_numpy()).all()
+    for track, group in lapped.groupby("track"):
+        by_grip = group.sort_values("vehicle_mu")["min_lap_time_s"].to_numpy()
+        assert (np.diff(by_grip) <= 1e-9).all(), track
+    # On a circle of radius r inside: 2 pi sqrt(r / (mu g)); walls 0.8 m from a radius of 5 m.
+    large = lapped[lapped["track"] == "ring5"]
+    inside = 5.0 - 0.8 + 0.155 + DEFAULT_MARGIN
+    expected = 2.0 * np.pi * np.sqrt(inside / (9.81 * large["vehicle_mu"]))
+    np.testing.assert_allclose(large["min_lap_time_s"], expected, rtol=0.015)
+    assert 0.0 <= lapped["min_lap_error"].min() <= lapped["min_lap_error"].max() < 0.01
+
+
+def test_no_yardstick_is_asked_for_or_can_be_planned(caplog, monkeypatch):
+    """What was raced counts all the same, and it is said why the ratio is missing."""
+    alone = evaluate(follower(), SLIPPERY, [SMALL], episodes=2, seed=5, lap_time_ratios=False)
+    assert np.isnan(alone["lap_time_ratio"].to_numpy()).all()
+
+    def fail(*_: Any) -> None:
+        raise OutlapError("track ring5: at s = 1.0 m it is narrower than the car")
+
+    monkeypatch.setattr(rollout, "min_laps", fail)
+    rows = evaluate(follower(), SLIPPERY, [LARGE], episodes=6, seed=5)
+    assert rows["completed_laps"].to_numpy().max() > 0
+    assert np.isnan(rows["lap_time_ratio"].to_numpy()).all()
+    assert "no lap_time_ratio: track ring5: at s = " in caplog.text

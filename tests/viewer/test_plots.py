@@ -16,7 +16,7 @@ from outlap.errors import OutlapError
 from outlap.track.generate import generate_track
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
-from outlap.viewer.plots import BLUE, VERMILLION, WALL_GREY, draw_track
+from outlap.viewer.plots import BLUE, VERMILLION, WALL_GREY, draw_raceline, draw_track
 
 
 @pytest.fixture(scope="module")
@@ -129,3 +129,19 @@ def test_unknown_format_is_named(track, tmp_path):
 def test_leaves_matplotlibs_global_state_alone():
     code = "import sys, outlap.viewer.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_raceline_is_coloured_by_its_speed(track, tmp_path):
+    """The first half of the centreline is driven slowly and the rest fast: dark and bright in viridis."""
+    line = track.centerline
+    s = np.linspace(0.0, line.length, 400, endpoint=False)
+    x, y = line.position(s).T
+    speed = np.where(s < 0.5 * line.length, 2.0, 6.0)
+    zero = np.zeros_like(s)
+    raceline = Raceline(s, x, y, line.heading(s), line.curvature(s), speed, zero)
+    figure = draw_raceline(track, raceline, tmp_path / "line.png", lap_time=12.345)
+    colours = colours_at(figure, x, y)
+    bright = colours.sum(axis=1)
+    assert np.median(bright[speed < 3.0]) < 1.0 < 1.5 < np.median(bright[speed > 3.0])
+    assert "lap 12.35 s" in figure.axes[0].get_title("left") or "lap 12.34 s" in figure.axes[0].get_title("left")
+    assert min(Image.open(tmp_path / "line.png").size) > 500

@@ -81,7 +81,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    _show_log()
     prog = "outlap"
     try:
         text = _information(arguments)
@@ -103,10 +102,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return OUTPUT_CLOSED
 
 
-def _show_log() -> None:
-    """What outlap logs goes to standard error: what takes long, and what was left out."""
+def _show_log(quiet: bool) -> None:
+    """What outlap logs goes to standard error: what takes long, unless quiet, and what was left out."""
     log = logging.getLogger("outlap")
-    log.setLevel(logging.INFO)
+    log.setLevel(logging.WARNING if quiet else logging.INFO)
     for handler in log.handlers[:]:  # of a command before in the same process, whose standard error may be closed
         log.removeHandler(handler)
     log.addHandler(logging.StreamHandler())
@@ -121,6 +120,7 @@ def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:
         command = parse(command_class, arguments, prog)
     except SystemExit:  # after --help
         return DONE
+    _show_log(quiet=getattr(command, "quiet", False))
     check_json_path(command.json)
     only_json = command.json == STANDARD_OUTPUT
     with standard_output_kept_clean() if only_json else contextlib.nullcontext():

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from outlap.planning.limits import Limits
+    from outlap.simulator.vehicle import VehicleParams
+    from outlap.track import Track
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,8 @@ class PlanRaceline:
     """Name, map folder or centreline csv."""
 
     vehicle: str = "f1tenth"
-    """The car: a preset (f1tenth, paper), a yaml file of its parameters, or a run folder, whose car it is; of ranges,
-    the middle counts."""
+    """The car: a preset (f1tenth, paper), a yaml file of its parameters, a run folder, whose car it is; of ranges, the
+    middle counts. Or track: what the track's own raceline asks of a car."""
 
     method: Literal["centerline", "min-curvature", "min-time"] = "min-time"
     """Of finding the line; its speeds are always the fastest that the car can drive on it."""
@@ -59,8 +61,6 @@ class PlanRaceline:
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
-        import logging
-
         from outlap.planning.friction import FrictionMap
         from outlap.planning.plan import DEFAULT_MARGIN, plan_line
         from outlap.track import Track
@@ -71,15 +71,13 @@ class PlanRaceline:
             if value is not None and not 0.0 < value < float("inf"):
                 raise OutlapError(f"--{flag.replace('_', '-')} is {value}; must be > 0")
         track = Track.load(self.track)
-        limits = self._limits()
+        limits = self._limits(track)
         friction = None if self.friction is None else FrictionMap.read(self.friction, track.centerline.length)
         out = self.out or Path(f"{track.name}_raceline.csv")
         picture = out.with_suffix(".png")
         if out.is_dir() or out.suffix.lower() != ".csv":
             raise OutlapError(f"--out is {out}; must be a file that ends in .csv")
         margin = DEFAULT_MARGIN if self.margin is None else self.margin
-        if self.quiet:
-            logging.getLogger("outlap").setLevel(logging.WARNING)
         line = plan_line(track, limits, self.method, margin, friction)
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
@@ -96,6 +94,7 @@ class PlanRaceline:
             "length_m": round(line.path.length, 3),
             "solve_time_s": round(line.solve_time, 2),
             "min_margin_m": round(line.min_margin, 4),
+            "own_lap_time_s": None if track.raceline is None else round(track.raceline.lap_time, 4),
             "limits": limits,
             "raceline": out,
             "picture": picture,
@@ -108,22 +107,30 @@ class PlanRaceline:
                 f"walls; planned in {line.solve_time:.1f} s",
                 highlight=False, markup=False, soft_wrap=True,
             )  # fmt: skip
+            if track.raceline is not None:
+                console.print(f"the track's own raceline: {track.raceline.lap_time:.2f} s", highlight=False)
             for what, path in (("raceline", out), ("picture", picture)):
                 console.print(f"{what}: {path}", highlight=False, markup=False, soft_wrap=True)
 
         return CommandResult(data, show)
 
-    def _limits(self) -> Limits:
+    def _limits(self, track: Track) -> Limits:
         from outlap.planning.limits import Limits
+        from outlap.simulator.vehicle import VehicleParams
 
-        limits = Limits.of(find_vehicle(self.vehicle))
+        if self.vehicle == "track":
+            if track.raceline is None:
+                raise OutlapError(f"--vehicle is 'track'; {track.name} has no raceline that could ask anything")
+            limits = Limits.of(VehicleParams()).implied_by(track.raceline)
+        else:
+            limits = Limits.of(find_vehicle(self.vehicle))
         changes = {name: value for name in ("v_max", "mu", "a_max") if (value := getattr(self, name)) is not None}
         if self.a_max is not None or self.a_brake is not None:
             changes["a_brake"] = self.a_brake or self.a_max
         return replace(limits, **changes)
 
 
-def find_vehicle(name: str) -> Any:
+def find_vehicle(name: str) -> VehicleParams:
     """The car that a preset, a yaml file or a run folder has.
 
     Raises OutlapError for a name that is none of these.
@@ -139,4 +146,4 @@ def find_vehicle(name: str) -> Any:
         return load_config(VehicleParams, path)
     if (path / "config.yaml").is_file():
         return load_run(path).config.env.vehicle
-    raise OutlapError(f"--vehicle is {name!r}; must be one of {', '.join(PRESETS)}, a yaml file or a run folder")
+    raise OutlapError(f"--vehicle is {name!r}; must be one of {', '.join(PRESETS)}, a yaml file, a run folder or track")

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from outlap.errors import OutlapError
 from outlap.simulator import vehicle
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+from outlap.track.raceline import Raceline
 
 GRAVITY = 9.81  # [m/s²]
+LEAST = 0.01  # of what a line that never turns, or never changes its speed, asks for
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,17 @@ class Limits:
             "width": p[vehicle.WIDTH],
         }
         return cls(**{name: float(f"{value:.6g}") for name, value in values.items()})
+
+    def implied_by(self, line: Raceline) -> Limits:
+        """What a raceline with speeds asks of a car: its extremes of speed and acceleration, and this car's body."""
+        return replace(
+            self,
+            mu=max(float(np.max(line.speed**2 * np.abs(line.curvature))) / GRAVITY, LEAST),
+            a_max=max(float(line.acceleration.max()), LEAST),
+            a_brake=max(-float(line.acceleration.min()), LEAST),
+            v_max=float(line.speed.max()),
+            v_switch=float(line.speed.max()),
+        )
 
     @classmethod
     def of(cls, params: VehicleParams) -> Limits:

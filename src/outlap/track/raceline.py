@@ -18,3 +18,9 @@ class Raceline:
     curvature: np.ndarray  # (n,) [1/m]
     speed: np.ndarray  # (n,) [m/s]
     acceleration: np.ndarray  # (n,) [m/s²] longitudinal
+
+    @property
+    def lap_time(self) -> float:
+        """At these speeds, with constant acceleration from point to point [s]."""
+        steps = np.hypot(np.roll(self.x, -1) - self.x, np.roll(self.y, -1) - self.y)
+        return float(np.sum(2.0 * steps / (self.speed + np.roll(self.speed, -1))))
