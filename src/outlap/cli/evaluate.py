@@ -42,6 +42,9 @@ class Evaluate:
     driver: Annotated[Positional[str], arg(metavar="RUN")]
     """A run folder of `outlap train`, an opponent such as population/NAME, or a driver without one: pure-pursuit."""
 
+    task: str | None = None
+    """A run folder: race its cars, with their ranges, on its held-out tracks; by default the driver's own."""
+
     tracks: tuple[str, ...] = ()
     """Names or map folders; by default the run's held-out tracks, or else the built-in held-out ones."""
 
@@ -96,12 +99,16 @@ class Evaluate:
     def run(self) -> CommandResult:
         self._check_flags()
         from outlap.envs.tasks import load_tracks
-        from outlap.evaluation.rollout import standing_starts
+        from outlap.evaluation.rollout import made_for, standing_starts
+        from outlap.training.run import load_run
 
         if self.stochastic and not is_run(self.driver):
             raise OutlapError(f"--stochastic is for a trained run; {self.driver} draws nothing")
         driver, trained_env, run = find_subject(self.driver, deterministic=not self.stochastic, seed=self.seed)
-        tracks = load_tracks(self.tracks or held_out_tracks(run))
+        setter = run if self.task is None else load_run(self.task)
+        if self.task is not None and setter is not None:
+            trained_env = made_for(driver, setter.config.env)
+        tracks = load_tracks(self.tracks or held_out_tracks(setter))
         env = self._as_asked(with_top_speed(trained_env, self.v_max))
         env = standing_starts(env, tracks, self.laps, self.time_limit)
         home = run.folder if run else Path("runs") / driver.name

@@ -88,7 +88,7 @@ def _make(track: Track, low: Limits, high: Limits) -> MinLaps:
         return replace(middle, **values)
 
     def solved(limits: Limits) -> Path:
-        return problem.solve(limits).path.resampled(SPACING)
+        return problem.solve(limits).resampled(SPACING)
 
     ends = [solved(car({name: end})) for name in drawn for end in (0.0, 1.0)]
     table = MinLaps((line, *ends), 0.0)

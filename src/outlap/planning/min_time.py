@@ -15,8 +15,6 @@ tyre-road friction coefficients, Vehicle System Dynamics 59, 2021).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi
 import numpy as np
 
@@ -36,21 +34,14 @@ SMOOTHNESS = 1e-3  # [s m³] of (change of curvature)²: picks the calmer of lin
 LANES = 9  # places across the corridor at which friction is looked up, where it differs
 ITERATIONS = 400
 
+PARAMETERS = ("mu", "a_max", "a_brake", "v_max", "v_switch", "steer_rate_max")  # limits that a solution is for
+
 # What a point must keep to, in the order of the rows of the problem.
 CONSTRAINTS = (
     "the friction ellipse", "the motor's power", "the steering rate", "the track's width at the body's corners",
     "the track's width",
 )  # fmt: skip
 DYNAMICS = ("the offset", "the direction of travel", "the curvature", "the speed")
-
-
-@dataclass(frozen=True)
-class Solution:
-    """A line, and how it was found."""
-
-    path: Path
-    lap_time: float  # [s] by the collocation
-    iterations: int
 
 
 class MinTimeProblem:
@@ -69,55 +60,58 @@ class MinTimeProblem:
     ) -> None:
         self.track = track
         self.reference = reference
-        right, left = corridor(track, reference, 0.5 * body.width + margin)
-        # The reference itself is allowed: the pixels' stairs may leave it a centimetre short.
-        self._right, self._left = np.minimum(right, 0.0), np.maximum(left, 0.0)
+        self._right, self._left = corridor(track, reference, 0.5 * body.width + margin)
         self._friction = friction
         self._mu, self._lane = self._friction_across()
         self._solver = self._build(body)
 
-    def solve(self, limits: Limits, start: Path | None = None) -> Solution:
-        """The fastest line for a car.
-
-        Args:
-            limits: of the car; its body is that of the problem.
-            start: a line to begin from, with as many points as the reference; none: the reference.
+    def solve(self, limits: Limits) -> Path:
+        """The fastest line for a car with these limits, and the body of the problem; it begins from the reference.
 
         Raises OutlapError that names the arc length and the constraint where the solver comes to no line.
         """
-        n, h = len(self.reference.points), self.reference.spacing
-        top = limits.v_max**2
-        drive, brake = min(limits.a_max, limits.grip), min(limits.a_brake, limits.grip)
-        speed = speed_profile(self.reference.curvature, h, limits, self._mu_on_reference(limits))
-        acceleration = np.gradient(np.concatenate([speed[-1:], speed, speed[:1]]) ** 2, h)[1:-1] / 2.0
-        guess = np.zeros((n, 6))
-        guess[:, 2] = np.clip(self.reference.curvature, -limits.max_curvature, limits.max_curvature)
-        guess[:, 3] = speed**2 / top
-        guess[:, 4] = np.clip(acceleration, -brake, drive) / GRAVITY
-        guess[:, 5] = np.gradient(self.reference.curvature, h)
-        low = np.tile(
-            [-np.inf, -STEEPEST, -limits.max_curvature, min(0.9, SLOWEST**2 / top), -limits.a_brake / GRAVITY, -np.inf],
-            (n, 1),
-        )
-        high = np.tile([np.inf, STEEPEST, limits.max_curvature, 1.0, limits.a_max / GRAVITY, np.inf], (n, 1))
-        constraint_low = np.zeros((n, len(DYNAMICS) + len(CONSTRAINTS)))
-        constraint_high = np.zeros_like(constraint_low)
-        rows = constraint_low[:, len(DYNAMICS) :], constraint_high[:, len(DYNAMICS) :]
-        rows[0][:] = [-np.inf, -np.inf, -1.0, 0.0, 0.0]
-        rows[1][:] = 1.0
-        for column in (3, 4):
-            rows[0][:, column], rows[1][:, column] = self._right, self._left
-        parameters = [limits.mu, limits.a_max, limits.a_brake, limits.v_max, limits.v_switch, limits.steer_rate_max]
+        low, high = self._variable_bounds(limits)
+        constraint_low, constraint_high = self._constraint_bounds()
         found = self._solver(
-            x0=guess.ravel(), lbx=low.ravel(), ubx=high.ravel(), lbg=constraint_low.ravel(),
-            ubg=constraint_high.ravel(), p=parameters,
+            x0=self._guess(limits).ravel(), lbx=low.ravel(), ubx=high.ravel(), lbg=constraint_low.ravel(),
+            ubg=constraint_high.ravel(), p=[getattr(limits, name) for name in PARAMETERS],
         )  # fmt: skip
         stats = self._solver.stats()
         if not stats["success"]:
-            values = np.asarray(found["g"]).reshape(n, -1)
-            raise OutlapError(self._complaint(stats["return_status"], values, constraint_low, constraint_high))
-        state = np.asarray(found["x"]).reshape(n, 6)
-        return Solution(self._path(state), float(found["f"]), int(stats["iter_count"]))
+            values = np.asarray(found["g"]).reshape(constraint_low.shape)
+            excess = np.maximum(constraint_low - values, values - constraint_high)
+            raise OutlapError(self._complaint(stats["return_status"], excess))
+        return self._path(np.asarray(found["x"]).reshape(low.shape))
+
+    def _guess(self, limits: Limits) -> np.ndarray:
+        """The reference, at its fastest speeds: (n, 6)."""
+        curvature, h = self.reference.curvature, self.reference.spacing
+        mu = None
+        if self._friction is not None:
+            mu = self._friction.at(*self.track.centerline.to_frenet(*self.reference.points.T))
+        square = speed_profile(curvature, h, limits, mu) ** 2
+        zero = np.zeros_like(curvature)
+        columns = [
+            zero, zero, np.clip(curvature, -limits.max_curvature, limits.max_curvature), square / limits.v_max**2,
+            (np.roll(square, -1) - np.roll(square, 1)) / (4.0 * h) / GRAVITY,
+            (np.roll(curvature, -1) - np.roll(curvature, 1)) / (2.0 * h),
+        ]  # fmt: skip
+        return np.column_stack(columns)
+
+    def _variable_bounds(self, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+        """What the variables of each point lie between: two (n, 6)."""
+        slowest = min(0.9, (SLOWEST / limits.v_max) ** 2)
+        low = [-np.inf, -STEEPEST, -limits.max_curvature, slowest, -limits.a_brake / GRAVITY, -np.inf]
+        high = [np.inf, STEEPEST, limits.max_curvature, 1.0, limits.a_max / GRAVITY, np.inf]
+        n = len(self.reference.points)
+        return np.tile(low, (n, 1)), np.tile(high, (n, 1))
+
+    def _constraint_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """What DYNAMICS and CONSTRAINTS of each point lie between: two (n, 9)."""
+        n = len(self.reference.points)
+        free, one, zeros = np.full((n, 1), np.inf), np.ones((n, 1)), np.zeros((n, len(DYNAMICS)))
+        right, left = self._right[:, None], self._left[:, None]
+        return np.hstack([zeros, -free, -free, -one, right, right]), np.hstack([zeros, one, one, one, left, left])
 
     def _path(self, state: np.ndarray) -> Path:
         offset, direction, curvature = state[:, 0], state[:, 1], state[:, 2]
@@ -128,7 +122,7 @@ class MinTimeProblem:
 
     def _build(self, body: Limits) -> casadi.Function:
         n, h = len(self.reference.points), self.reference.spacing
-        z, p = casadi.SX.sym("z", 6), casadi.SX.sym("p", 6)
+        z, p = casadi.SX.sym("z", 6), casadi.SX.sym("p", len(PARAMETERS))
         mu, a_max, a_brake, v_max, v_switch, steer_rate_max = casadi.vertsplit(p)
         here = casadi.SX.sym("here", 1 + 2 * LANES)  # curvature of the reference; places across, friction there
         bend = here[0]
@@ -159,7 +153,7 @@ class MinTimeProblem:
         point = casadi.Function("point", [z, here, p], [rates, driven / speed, kept])
         table = np.column_stack([self.reference.curvature, self._lane, self._mu])
         x = casadi.MX.sym("x", 6 * n)
-        parameters = casadi.MX.sym("parameters", 6)
+        parameters = casadi.MX.sym("parameters", len(PARAMETERS))
         columns = casadi.reshape(x, 6, n)
         rates_all, pace, kept_all = point.map(n)(columns, casadi.DM(table).T, casadi.repmat(parameters, 1, n))
         state = columns[:4, :]
@@ -189,20 +183,14 @@ class MinTimeProblem:
         s, d = self.track.centerline.to_frenet(places[..., 0], places[..., 1])
         return self._friction.at(s, d), lane
 
-    def _mu_on_reference(self, limits: Limits) -> np.ndarray | None:
-        if self._friction is None:
-            return None
-        return self._friction.at(*self.track.centerline.to_frenet(*self.reference.points.T))
-
-    def _complaint(self, status: str, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
+    def _complaint(self, status: str, excess: np.ndarray) -> str:
         """What an unsolved problem is stuck at: the constraint that is broken most, and where."""
-        excess = np.maximum(low - values, values - high)
         point, row = np.unravel_index(np.nanargmax(excess), excess.shape)
         s = float(self.track.centerline.to_frenet(*self.reference.points[point])[0])
-        names = [*(f"the dynamics of {name}" for name in DYNAMICS), *CONSTRAINTS]
+        name = (*(f"the dynamics of {name}" for name in DYNAMICS), *CONSTRAINTS)[row]
         return (
-            f"track {self.track.name}: the solver came to no minimum-time line ({status}); at s = {s:.1f} m, "
-            f"{names[row]} is broken by {excess[point, row]:.2g}; take a smaller margin, or a car that can do more"
+            f"track {self.track.name}: the solver came to no minimum-time line ({status}); at s = {s:.1f} m, {name} is "
+            f"broken by {excess[point, row]:.2g}; take a smaller margin, or a car that can do more"
         )
 
 

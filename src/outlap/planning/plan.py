@@ -122,7 +122,7 @@ def _least_time(track: Track, limits: Limits, margin: float, reference: Path, fr
         log.info("%s: the line of least time, round %d", track.name, number)
         try:
             problem = MinTimeProblem(track, path.resampled(spacing_for(path)), limits, kept, friction)
-            path = problem.solve(limits).path
+            path = problem.solve(limits)
         except OutlapError:
             if number == 1:
                 raise
