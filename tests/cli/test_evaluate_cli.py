@@ -214,3 +214,20 @@ def test_interrupted_it_leaves_no_folder(made, here, monkeypatch, capfd):
     monkeypatch.setattr(PolicyDriver, "act", interrupt)
     assert main(["evaluate", run_of(made), "--tracks", "ring4", "--out", "x", "--quiet"]) == 130
     assert not (here / "x").exists()
+
+
+def test_a_driver_without_a_run_races_the_task_of_one(made, here, capfd):
+    """The run's cars, with their ranges, on its held-out tracks, along a line planned for them."""
+    words = ["evaluate", "pure-pursuit", "--task", run_of(made), "--racing-line", "min-time", "--episodes", "3"]
+    assert main([*words, "--laps", "1", "--out", "here", "--json", "-", "--quiet"]) == 0
+    summary = json.loads(capfd.readouterr()[0])
+    rows = pd.read_parquet("here/episodes.parquet")
+    assert list(summary["tracks"]) == ["ring4"]
+    friction = rows["vehicle_mu"].to_numpy()
+    assert 0.5 <= friction.min() < friction.max() <= 1.0
+    assert json.loads(Path("here/evaluation.json").read_text())["env"]["racing_line"] == "min-time"
+
+
+def test_a_racing_line_is_for_those_who_follow_one(made, fail):
+    line = fail("follow-the-gap", "--tracks", "ring5", "--racing-line", "min-time")
+    assert "--racing-line is min-time; follow-the-gap follows no line" in line

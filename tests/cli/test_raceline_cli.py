@@ -77,6 +77,15 @@ def test_it_is_compared_with_the_raceline_that_the_track_has(tmp_path, capfd):
     assert data["lap_time_s"] < data["own_lap_time_s"]
 
 
+def test_a_maps_own_raceline_is_not_replaced_unasked(tmp_path, monkeypatch, capfd):
+    folder = ring(5.0).save(tmp_path / "ring5")
+    monkeypatch.chdir(folder)
+    assert main(["raceline", ".", "--method", "centerline"]) == 2
+    assert "belongs to the map in this folder; to replace it, give --out ring5_raceline.csv" in capfd.readouterr()[1]
+    assert main(["raceline", ".", "--method", "centerline", "--out", "ring5_raceline.csv"]) == 0
+    assert (folder / "ring5_raceline.csv").is_file()
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [

@@ -10,8 +10,12 @@ import pytest
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_PRESETS, REWARD_TERMS, RewardConfig
 from outlap.errors import OutlapError
+from outlap.planning.kept import kept_line
+from outlap.planning.limits import Limits
 from outlap.planning.plan import DEFAULT_MARGIN
+from outlap.simulator.atlas import FIRST_ROW, ROWS
 from outlap.simulator.vehicle import MU
+from outlap.track.generate import generate_track
 
 STANDSTILL = -0.6  # the speed action that stands for 0 m/s between -5 and 20
 
@@ -200,6 +204,29 @@ def test_the_reference_speed_is_that_of_the_very_car(big_circle):
     mu = race.worlds.params[:, 0, MU]
     np.testing.assert_allclose(speeds**2 / mu, (speeds**2 / mu)[0], rtol=2e-2)
     assert mu.max() - mu.min() > 0.2
+
+
+def test_the_reference_is_that_of_the_place_and_of_the_track():
+    """Two circuits in one environment: everywhere on either, the speed of the line's nearest point."""
+    tracks = [generate_track(seed, length=60.0, name=f"track{seed}") for seed in (1, 2)]
+    env = RaceVectorEnv(8, tracks=tracks, beams=0, reward=only(velocity_matching=1.0), vehicle={"v_max": 8.0})
+    env.reset(seed=1)
+    race, seen = env.race, set()
+    assert race.reference is not None
+    atlas = race.simulator.atlas
+    for world, number in enumerate(race.worlds.track.tolist()):
+        track, (first, rows) = tracks[number], atlas.index[number, [FIRST_ROW, ROWS]]
+        line = kept_line(track, Limits.of_row(race.worlds.params[world, 0]))
+        at, _ = track.centerline.to_frenet(*line.path.points.T)
+        for row in range(0, rows, 40):
+            everyone = np.full(8, atlas.index[race.worlds.track, FIRST_ROW])
+            everyone[world] = first + row
+            away = np.abs((at - row * track.centerline.length / rows + 5.0) % track.centerline.length - 5.0)
+            expected = line.speed[away.argmin()]
+            assert race.reference.at(0, race.worlds.track, everyone)[world] == pytest.approx(expected, rel=0.03)
+            seen.add(round(float(expected), 1))
+    assert len(seen) > 5, "the test needs fast and slow places"
+    assert set(race.worlds.track.tolist()) == {0, 1}
 
 
 def test_the_reference_speed_is_no_more_than_the_car_can_drive(big_circle, put):

@@ -85,3 +85,9 @@ def test_a_rectangle_in_a_wall_has_a_negative_margin():
     track = ring(6.0)
     outside = ring(6.0 + 1.2)
     assert (wall_margin(track, path_along(outside.centerline, 1.0), CAR) < 0.0).all()
+
+
+def test_without_walls_there_is_nothing_to_come_near_to():
+    track = ring(6.0)
+    open_ground = Track("open", np.zeros_like(track.occupancy), track.resolution, track.origin, track.centerline)
+    assert np.isinf(wall_margin(open_ground, path_along(track.centerline, 2.0), CAR)).all()

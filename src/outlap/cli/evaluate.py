@@ -43,7 +43,8 @@ class Evaluate:
     """A run folder of `outlap train`, an opponent such as population/NAME, or a driver without one: pure-pursuit."""
 
     task: str | None = None
-    """A run folder: race its cars, with their ranges, on its held-out tracks; by default the driver's own."""
+    """A run folder: race as in its training, its cars with their ranges, on its held-out tracks; of a driver that has a
+    scanner and a top speed of its own, those stay. By default the driver's own task."""
 
     tracks: tuple[str, ...] = ()
     """Names or map folders; by default the run's held-out tracks, or else the built-in held-out ones."""
@@ -105,11 +106,14 @@ class Evaluate:
         if self.stochastic and not is_run(self.driver):
             raise OutlapError(f"--stochastic is for a trained run; {self.driver} draws nothing")
         driver, trained_env, run = find_subject(self.driver, deterministic=not self.stochastic, seed=self.seed)
-        setter = run if self.task is None else load_run(self.task)
-        if self.task is not None and setter is not None:
-            trained_env = made_for(driver, setter.config.env)
-        tracks = load_tracks(self.tracks or held_out_tracks(setter))
+        task = run
+        if self.task is not None:
+            task = load_run(self.task)
+            trained_env = made_for(driver, task.config.env)
+        tracks = load_tracks(self.tracks or held_out_tracks(task))
         env = self._as_asked(with_top_speed(trained_env, self.v_max))
+        if self.racing_line and env.num_cars == 1 and "line_ahead" not in driver.observation_terms:
+            raise OutlapError(f"--racing-line is {self.racing_line}; {driver.name} follows no line")
         env = standing_starts(env, tracks, self.laps, self.time_limit)
         home = run.folder if run else Path("runs") / driver.name
         folder = self.out or unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
@@ -271,7 +275,7 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
         style="dim", highlight=False, markup=False,
     )  # fmt: skip
     if (error := data["all"]["min_lap_error"]) is not None:
-        exact = f", found to {100.0 * error:.2f} % at worst" if error else ""
+        exact = f", too long by up to {100.0 * error:.2f} % for two cars drawn at random" if error else ""
         console.print(
             f"lap / least: lap time over the minimum-time lap of the same track and vehicle{exact}",
             style="dim", highlight=False, markup=False,
@@ -286,7 +290,6 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
 DRIVING = ("crash_rate", "completed_laps", "lap_time_s", "lap_time_ratio", "mean_speed_mps")
 RACING = ("crashes", "overtakes", "places_lost")
 EPISODES = ("progress_m", "episode_steps", "episode_return")
-DIGITS = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "lap_time_ratio": 3, "episode_return": 1}
 DIGITS = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "lap_time_ratio": 3, "episode_return": 1}
 HEADINGS = {
     "crash_rate": "crash rate",

@@ -24,6 +24,7 @@ from outlap.cli.output import (
 )
 from outlap.errors import OutlapError
 
+SHOWN = "outlap-cli"  # name of the handler that shows what is logged
 DONE, BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED = 0, 2, 130, 141
 
 
@@ -107,8 +108,11 @@ def _show_log(quiet: bool) -> None:
     log = logging.getLogger("outlap")
     log.setLevel(logging.WARNING if quiet else logging.INFO)
     for handler in log.handlers[:]:  # of a command before in the same process, whose standard error may be closed
-        log.removeHandler(handler)
-    log.addHandler(logging.StreamHandler())
+        if handler.name == SHOWN:
+            log.removeHandler(handler)
+    shown = logging.StreamHandler()
+    shown.name = SHOWN
+    log.addHandler(shown)
 
 
 def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:

@@ -73,7 +73,11 @@ class PlanRaceline:
         track = Track.load(self.track)
         limits = self._limits(track)
         friction = None if self.friction is None else FrictionMap.read(self.friction, track.centerline.length)
+        if friction is not None and self.mu is not None:
+            raise OutlapError(f"--mu is {self.mu}; {self.friction} says what friction is where, give one of them")
         out = self.out or Path(f"{track.name}_raceline.csv")
+        if self.out is None and Path(f"{track.name}_map.yaml").is_file():
+            raise OutlapError(f"{out}: belongs to the map in this folder; to replace it, give --out {out}")
         picture = out.with_suffix(".png")
         if out.is_dir() or out.suffix.lower() != ".csv":
             raise OutlapError(f"--out is {out}; must be a file that ends in .csv")

@@ -15,14 +15,15 @@ class PurePursuit:
 
     The point is farther ahead the faster the car is, and the farther it is from the line. At the limit of grip a car
     slides: the arc begins in its direction of travel, not along its nose; understeer is made up for, and what the yaw
-    rate lacks of the arc's is steered too, which catches the tail that braking makes light. The line is the
-    environment's `racing_line`.
+    rate lacks of the arc's is steered too, which catches the tail that braking makes light. Farther from the line it
+    drives no faster than a gentle arc back allows. The line is the environment's `racing_line`.
     """
 
     lookahead: float = 0.4  # [m] at a standstill
     lookahead_time: float = 0.12  # [s] more for every m/s
     lookahead_per_offset: float = 4.0  # [m] more for every metre from the line beyond
     near: float = 0.3  # [m]
+    return_acceleration: float = 3.0  # across, on the way back to the line from farther away [m/s²]
     understeer: float = 0.0028  # steering more for every m/s² across [rad s²/m]: what the default car's tyres ask for
     yaw_rate_gain: float = 0.18  # steering for what the yaw rate lacks [s]
     speed_share: float = 1.0  # of the line's speed
@@ -50,6 +51,8 @@ class PurePursuit:
         lacking = forward * curvature - yaw_rate
         more = self.understeer * forward**2 * curvature + self.yaw_rate_gain * lacking
         speed = self.speed_share * _where_reached(away, line[..., 2], self.preview_time * forward)
+        returning = np.sqrt(self.return_acceleration / np.maximum(np.abs(curvature), 1e-3))
+        speed = np.where(offset > 0.0, np.minimum(speed, returning), speed)
         span = observation["action_span"]
         return np.stack([steer_action(curvature + more / WHEELBASE, span), speed_action(speed, span)], axis=1)
 

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from outlap.config import bounds, validate
+from outlap.drivers.driver import Driver
 from outlap.drivers.find import Named, driver_name, find_drivers
 from outlap.envs.actions import commands, speed_spans
 from outlap.envs.observations import observation_space, observe
@@ -99,7 +100,12 @@ class RaceVectorEnv(VectorEnv):
         self.tasks = TaskSet(loaded, self.config.vehicle, self.config.actuators, self.config.lidar)
         simulator = Simulator(loaded, num_envs, self.config.num_cars, self.config, self.tasks.max_delay)
         typical = np.mean(parameter_bounds(self.config.vehicle), axis=0)
-        line = racing_lines(loaded, simulator.atlas, typical, self.config.racing_line)
+        drivers = self._find_opponents(self.config.opponents if rivals is None else rivals)
+        looked_at = any(
+            "line_ahead" in terms
+            for terms in (self.config.observation, *(driver.observation_terms for driver in drivers))
+        )
+        line = racing_lines(loaded, simulator.atlas, typical, self.config.racing_line if looked_at else "track")
         self._weights = self.config.reward.resolved()
         reference = None
         if "velocity_matching" in self._weights:
@@ -116,7 +122,9 @@ class RaceVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        self._opponents = self._find_opponents(self.config.opponents if rivals is None else rivals)
+        self._opponents = None
+        if drivers:
+            self._opponents = Opponents(drivers, self.race, self.config.opponent_speed, self.config.opponent_noise)
         self._keys: np.ndarray | None = None
         self._episode = np.zeros(num_envs, np.int64)  # number of each world's episode since it was seeded
         self._over = np.ones(num_envs, bool)  # waits for a reset
@@ -304,12 +312,11 @@ class RaceVectorEnv(VectorEnv):
             everyone[:, 1:] = self._opponents.act()
         return everyone
 
-    def _find_opponents(self, names: Sequence[Named]) -> Opponents | None:
+    def _find_opponents(self, names: Sequence[Named]) -> list[Driver]:
         config = self.config
-        if config.num_cars == 1 or not names:
-            return None
-        drivers = find_drivers(names, config.field_of_view, config.opponent_split, config.opponent_code)
-        return Opponents(drivers, self.race, config.opponent_speed, config.opponent_noise)
+        if config.num_cars == 1:
+            return []
+        return find_drivers(names, config.field_of_view, config.opponent_split, config.opponent_code)
 
     def _clear_wrecks(self) -> None:
         """Do with opponents that crashed as configured, and count them."""

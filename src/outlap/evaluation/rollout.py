@@ -213,7 +213,7 @@ def _race(
                 **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
                 **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in range(1, config.num_cars)},
                 **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in opponents},
-                VEHICLE: info["vehicle"][world, EGO],
+                VEHICLE: info["vehicle"][world, EGO].copy(),
             }
         if over.any():
             again: list[int | None] = [None] * worlds  # an idle world goes on with a stream of its own
@@ -238,7 +238,7 @@ def _with_lap_time_ratios(
     lapped = np.array([row["completed_laps"] > 0 for row in rows])
     if wanted and lapped.any():
         try:
-            table = min_laps(track, *map(Limits.of_row, parameter_bounds(config.vehicle)))
+            table = min_laps(track, config.vehicle)
         except OutlapError as problem:  # of the yardstick alone: what was raced is worth no less
             log.warning("no lap_time_ratio: %s", problem)
         else:
@@ -256,6 +256,9 @@ def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[s
     settings["augment_tracks"] = False  # the track that was named, not one of its variants
     settings["observation"] = driver.observation_terms
     settings["scale_observations"] = driver.scale_observations
+    # At the end of every curriculum nothing is left of it: no lines need to be planned for a reference speed.
+    weights = {**config.reward.weights, "velocity_matching": 0.0}
+    settings["reward"] = config.reward.model_copy(update={"weights": weights})
     others: list[Driver] = []
     if config.num_cars > 1:
         others = find_drivers(config.opponents, config.field_of_view, config.opponent_split, config.opponent_code)

@@ -58,8 +58,9 @@ def corridor(track: Track, path: Path, radius: float) -> tuple[np.ndarray, np.nd
 def wall_margin(track: Track, path: Path, body: Limits) -> np.ndarray:
     """The distance from the car's body to the nearest wall, all along a line: (n,) [m], negative where it is in one."""
     half_length, half_width = 0.5 * body.length, 0.5 * body.width
-    lengthwise = np.linspace(-half_length, half_length, math.ceil(body.length / BODY_STEP) + 1)
-    crosswise = np.linspace(-half_width, half_width, math.ceil(body.width / BODY_STEP) + 1)
+    step = min(BODY_STEP, track.resolution)  # no pixel is stepped over
+    lengthwise = np.linspace(-half_length, half_length, math.ceil(body.length / step) + 1)
+    crosswise = np.linspace(-half_width, half_width, math.ceil(body.width / step) + 1)
     u, v = (each.ravel() for each in np.meshgrid(lengthwise, crosswise))
     cos, sin = np.cos(path.heading)[:, None], np.sin(path.heading)[:, None]
     x = path.points[:, :1] + cos * u - sin * v
@@ -68,6 +69,8 @@ def wall_margin(track: Track, path: Path, body: Limits) -> np.ndarray:
     rim = (np.abs(u) == half_length) | (np.abs(v) == half_width)
     col, row = track.world_to_grid(x[:, rim], y[:, rim])
     cells = _shore(track.occupancy)
+    if not len(cells):
+        return np.full(len(x), np.inf)
     _, near = KDTree(cells + 0.5).query(np.stack([col, row], axis=-1), k=4)
     near = np.minimum(near, len(cells) - 1)  # should there be fewer than four
     away_x = np.maximum(np.abs(cells[near, 0] + 0.5 - col[..., None]) - 0.5, 0.0)

@@ -66,8 +66,10 @@ def kept(
     made = make()
     buffer = io.BytesIO()
     np.savez(buffer, **to_arrays(made))  # type: ignore[arg-type]
-    with suppress(OSError):
+    try:
         atomic_write(file, buffer.getvalue())
+    except OSError as error:
+        log.warning("%s: cannot be kept (%s); set OUTLAP_CACHE to a folder that you can write to", file, error.strerror)
     return made
 
 

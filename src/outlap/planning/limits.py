@@ -9,10 +9,10 @@ import numpy as np
 
 from outlap.errors import OutlapError
 from outlap.simulator import vehicle
+from outlap.simulator.bicycle import GRAVITY
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds
 from outlap.track.raceline import Raceline
 
-GRAVITY = 9.81  # [m/s²]
 LEAST = 0.01  # of what a line that never turns, or never changes its speed, asks for
 
 

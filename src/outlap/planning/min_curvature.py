@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from outlap.errors import OutlapError
 from outlap.planning.corridor import corridor
+from outlap.planning.ipopt import QUIET, ended
 from outlap.planning.limits import Limits
 from outlap.planning.path import Path, path_along, path_through
 from outlap.track.track import Track
@@ -79,10 +80,7 @@ def _least_curvature(track: Track, path: Path, right: np.ndarray, left: np.ndarr
         },
         {
             "print_time": False,
-            "ipopt": {
-                "print_level": 0, "sb": "yes", "mehrotra_algorithm": "yes", "hessian_constant": "yes",
-                "jac_c_constant": "yes",
-            },
+            "ipopt": {**QUIET, "mehrotra_algorithm": "yes", "hessian_constant": "yes", "jac_c_constant": "yes"},
         },
     )  # fmt: skip
     free = np.full(n, np.inf)
@@ -90,9 +88,13 @@ def _least_curvature(track: Track, path: Path, right: np.ndarray, left: np.ndarr
         x0=np.concatenate([np.clip(0.0, low, high), path.curvature]),
         lbx=np.concatenate([low, -free]), ubx=np.concatenate([high, free]), lbg=0.0, ubg=0.0,
     )  # fmt: skip
-    status = solver.stats()["return_status"]
-    if not solver.stats()["success"]:
-        raise OutlapError(f"track {track.name}: the quadratic programme for least curvature ended with {status}")
+    if (failure := ended(solver)) is not None:
+        worst = int(np.abs(np.asarray(found["g"]).ravel()).argmax())
+        s = float(track.centerline.to_frenet(*path.points[worst])[0])
+        raise OutlapError(
+            f"track {track.name}: the quadratic programme for least curvature came to no line ({failure}); at "
+            f"s = {s:.1f} m its curvature does not follow from its offsets; take another margin"
+        )
     return np.clip(np.asarray(found["x"]).ravel()[:n], low, high)
 
 

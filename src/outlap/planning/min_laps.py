@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
+from outlap.errors import OutlapError
+from outlap.planning.corridor import wall_margin
 from outlap.planning.kept import kept, kept_line, path_arrays, path_of
 from outlap.planning.limits import Limits
 from outlap.planning.path import Path
-from outlap.planning.plan import DEFAULT_MARGIN, SPACING
+from outlap.planning.plan import DEFAULT_MARGIN, SPACING, plan_line
 from outlap.planning.speed_profile import lap_time, motor, speed_profiles
+from outlap.simulator.vehicle import VehicleParams, parameter_bounds
 from outlap.track.track import Track
 
-DRAWN = ("mu", "a_max", "a_brake", "v_max", "v_switch")  # what counts where it is drawn; of the rest, the middle does
+DRAWN = ("mu", "a_max", "v_max", "v_switch")  # what counts where it is drawn; of the rest, the middle does
 CHECKS = 2  # cars for which a table is compared with a line of their own
 
 log = logging.getLogger(__name__)
@@ -33,9 +35,9 @@ class MinLaps:
     """
 
     lines: tuple[Path, ...]
-    error: float  # by what part laps of the table were too long, at worst, for cars with lines of their own; 0: exact
+    error: float  # the largest part by which the laps of CHECKS cars were longer than on lines of their own; 0: one car
 
-    def of(self, cars: list[Limits]) -> np.ndarray:
+    def of(self, cars: Sequence[Limits]) -> np.ndarray:
         """Of some cars: (n,) [s]."""
         motors, mu = np.array([motor(car) for car in cars]), np.array([[car.mu] for car in cars])
         times = [
@@ -45,12 +47,15 @@ class MinLaps:
         return np.min(times, axis=0)
 
 
-@lru_cache(maxsize=64)
-def min_laps(track: Track, low: Limits, high: Limits) -> MinLaps:
-    """The table of a track for all cars between two; kept in memory and on disk.
+def min_laps(track: Track, vehicle: VehicleParams) -> MinLaps:
+    """The table of a track for all cars in the ranges of a vehicle; kept on disk.
 
-    Raises OutlapError where no line can be planned.
+    Of what is neither friction nor motor (size, wheelbase, steering) the middle counts.
+
+    Raises OutlapError where no line can be planned for the middle of the ranges.
     """
+    low, high = map(Limits.of_row, parameter_bounds(vehicle))
+    middle = Limits.of(vehicle)
 
     def to_arrays(table: MinLaps) -> dict[str, np.ndarray]:
         arrays = {"error": np.array(table.error), "count": np.array(len(table.lines))}
@@ -62,36 +67,40 @@ def min_laps(track: Track, low: Limits, high: Limits) -> MinLaps:
         lines = tuple(path_of(saved, f"{number}_") for number in range(int(saved["count"])))
         return MinLaps(lines, float(saved["error"]))
 
-    key = ["laps", track.fingerprint, asdict(low), asdict(high), DEFAULT_MARGIN]
-    return kept(key, lambda: _make(track, low, high), to_arrays, from_arrays)
+    key = ["laps", track.fingerprint, *map(asdict, (low, middle, high)), DEFAULT_MARGIN]
+    return kept(key, lambda: _table(track, low, middle, high), to_arrays, from_arrays)
 
 
-def _make(track: Track, low: Limits, high: Limits) -> MinLaps:
-    from outlap.planning.min_time import MinTimeProblem, spacing_for  # CasADi: not before it is needed
-
-    ends = asdict(low), asdict(high)
-    middle = Limits(**{name: 0.5 * (ends[0][name] + ends[1][name]) for name in ends[0]})
+def _table(track: Track, low: Limits, middle: Limits, high: Limits) -> MinLaps:
     line = kept_line(track, middle).path
     drawn = [name for name in DRAWN if getattr(low, name) < getattr(high, name)]
-    if "a_max" in drawn and "a_brake" in drawn:
-        drawn.remove("a_brake")  # a car brakes as hard as it accelerates
     if not drawn:
         return MinLaps((line,), 0.0)
-    log.info("planning %d lines of %s for the cars that are drawn", 2 * len(drawn) + CHECKS, track.name)
-    problem = MinTimeProblem(track, line.resampled(spacing_for(line)), middle, DEFAULT_MARGIN)
+    log.info("%s: planning %d more lines for the cars that are drawn", track.name, 2 * len(drawn) + CHECKS)
 
     def car(shares: Mapping[str, float]) -> Limits:
         """Of the middle, but for what is this share of the way from low to high."""
         values = {name: (1.0 - x) * getattr(low, name) + x * getattr(high, name) for name, x in shares.items()}
-        if "a_max" in values:
-            values["a_brake"] = values["a_max"]
-        return replace(middle, **values)
+        return replace(middle, **values, a_brake=values.get("a_max", middle.a_brake))
 
-    def solved(limits: Limits) -> Path:
-        return problem.solve(limits).resampled(SPACING)
-
-    ends = [solved(car({name: end})) for name in drawn for end in (0.0, 1.0)]
-    table = MinLaps((line, *ends), 0.0)
+    table = MinLaps((line, *_lines_about(line, track, [car({name: x}) for name in drawn for x in (0.0, 1.0)])), 0.0)
     checks = [car(dict(zip(drawn, x, strict=True))) for x in np.random.default_rng(0).random((CHECKS, len(drawn)))]
-    own = np.array([MinLaps((solved(check),), 0.0).of([check])[0] for check in checks])
+    own = [plan_line(track, check).lap_time for check in checks]
     return replace(table, error=max(0.0, float(np.max(table.of(checks) / own - 1.0))))
+
+
+def _lines_about(line: Path, track: Track, cars: Sequence[Limits]) -> list[Path]:
+    """The minimum-time lines of cars about a line nearby, as far as they are found and free of walls."""
+    from outlap.planning.min_time import MinTimeProblem, spacing_for  # CasADi: not before it is needed
+
+    problem = MinTimeProblem(track, line.resampled(spacing_for(line)), cars[0], DEFAULT_MARGIN)
+    lines = []
+    for limits in cars:
+        try:
+            found = problem.solve(limits).resampled(SPACING)
+        except OutlapError as error:  # the table has one line less, and its error tells what that costs
+            log.warning("left out of the table of lap times: %s", error)
+            continue
+        if wall_margin(track, found, limits).min() > 0.0:
+            lines.append(found)
+    return lines

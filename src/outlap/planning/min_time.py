@@ -21,9 +21,11 @@ import numpy as np
 from outlap.errors import OutlapError
 from outlap.planning.corridor import corridor
 from outlap.planning.friction import FrictionMap
-from outlap.planning.limits import GRAVITY, Limits
+from outlap.planning.ipopt import QUIET, ended
+from outlap.planning.limits import Limits
 from outlap.planning.path import Path, path_from
 from outlap.planning.speed_profile import speed_profile
+from outlap.simulator.bicycle import GRAVITY
 from outlap.track.track import Track
 
 POINTS = 2400  # of the collocation, at most
@@ -33,6 +35,7 @@ SLOWEST = 0.3  # [m/s]
 SMOOTHNESS = 1e-3  # [s m³] of (change of curvature)²: picks the calmer of lines that are as fast
 LANES = 9  # places across the corridor at which friction is looked up, where it differs
 ITERATIONS = 400
+FULFILLED = 1e-4  # by less, a constraint is not broken
 
 PARAMETERS = ("mu", "a_max", "a_brake", "v_max", "v_switch", "steer_rate_max")  # limits that a solution is for
 
@@ -76,12 +79,14 @@ class MinTimeProblem:
             x0=self._guess(limits).ravel(), lbx=low.ravel(), ubx=high.ravel(), lbg=constraint_low.ravel(),
             ubg=constraint_high.ravel(), p=[getattr(limits, name) for name in PARAMETERS],
         )  # fmt: skip
-        stats = self._solver.stats()
-        if not stats["success"]:
+        failure = ended(self._solver)
+        variables = np.asarray(found["x"]).reshape(low.shape)
+        if failure is not None:
             values = np.asarray(found["g"]).reshape(constraint_low.shape)
-            excess = np.maximum(constraint_low - values, values - constraint_high)
-            raise OutlapError(self._complaint(stats["return_status"], excess))
-        return self._path(np.asarray(found["x"]).reshape(low.shape))
+            excess = np.nan_to_num(np.maximum(constraint_low - values, values - constraint_high), nan=np.inf)
+            at_lock = np.abs(variables[:, 2]) > 0.99 * limits.max_curvature
+            raise OutlapError(self._complaint(failure, excess, at_lock))
+        return self._path(variables)
 
     def _guess(self, limits: Limits) -> np.ndarray:
         """The reference, at its fastest speeds: (n, 6)."""
@@ -167,8 +172,8 @@ class MinTimeProblem:
         options = {
             "print_time": False,
             "ipopt": {
-                "print_level": 0, "sb": "yes", "max_iter": ITERATIONS, "tol": 1e-6, "acceptable_tol": 1e-4,
-                "mu_strategy": "adaptive",
+                **QUIET, "max_iter": ITERATIONS, "tol": 1e-6, "acceptable_tol": 1e-4,
+                "acceptable_constr_viol_tol": FULFILLED, "mu_strategy": "adaptive",
             },
         }  # fmt: skip
         return casadi.nlpsol("min_time", "ipopt", problem, options)
@@ -183,14 +188,21 @@ class MinTimeProblem:
         s, d = self.track.centerline.to_frenet(places[..., 0], places[..., 1])
         return self._friction.at(s, d), lane
 
-    def _complaint(self, status: str, excess: np.ndarray) -> str:
+    def _complaint(self, failure: str, excess: np.ndarray, at_lock: np.ndarray) -> str:
         """What an unsolved problem is stuck at: the constraint that is broken most, and where."""
-        point, row = np.unravel_index(np.nanargmax(excess), excess.shape)
+        point, row = np.unravel_index(excess.argmax(), excess.shape)
         s = float(self.track.centerline.to_frenet(*self.reference.points[point])[0])
         name = (*(f"the dynamics of {name}" for name in DYNAMICS), *CONSTRAINTS)[row]
+        found = f"track {self.track.name}: the solver came to no minimum-time line ({failure}); "
+        if excess[point, row] < FULFILLED:
+            return (
+                f"{found}every constraint is kept, the nearest to being broken is {name} at s = {s:.1f} m, but there "
+                "may be faster lines; take min-curvature, or another margin"
+            )
+        lock = ", where the steering is at its lock" if at_lock[max(0, point - 2) : point + 3].any() else ""
         return (
-            f"track {self.track.name}: the solver came to no minimum-time line ({status}); at s = {s:.1f} m, {name} is "
-            f"broken by {excess[point, row]:.2g}; take a smaller margin, or a car that can do more"
+            f"{found}at s = {s:.1f} m{lock}, {name} is broken by {excess[point, row]:.2g}; take a smaller margin, or a "
+            "car that can do more"
         )
 
 

@@ -1,4 +1,4 @@
-"""Planning a line around a track: by name of the method, checked against the map, and kept for the next time."""
+"""Planning a line around a track by the name of the method, and checking it against the map."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class PlannedLine:
 
     @property
     def raceline(self) -> Raceline:
-        """As the F1TENTH file has it; an acceleration holds up to the next point."""
+        """As the F1TENTH file has it: headings in [0, 2 pi); an acceleration holds up to the next point."""
         path, square = self.path, self.speed**2
         acceleration = (np.roll(square, -1) - square) / (2.0 * path.spacing)
         x, y = path.points.T
-        return Raceline(path.s, x, y, path.heading, path.curvature, self.speed, acceleration)
+        return Raceline(path.s, x, y, np.mod(path.heading, 2.0 * math.pi), path.curvature, self.speed, acceleration)
 
 
 def plan_line(
@@ -84,11 +84,13 @@ def plan_line(
             fastest = _least_time(track, limits, margin, least, friction)
             timed = _timed(track, fastest.resampled(SPACING), limits, friction)
             # Both keep to the same limits, if the car can steer both: the slower one is not the minimum.
-            if timed[2] <= seconds or np.abs(path.curvature).max() > limits.max_curvature:
+            if timed[2] <= seconds or _beyond_lock(path, limits):
                 path, speed, seconds = timed
     margins = wall_margin(track, path, limits)
     planned = PlannedLine(path, speed, method, limits, seconds, float(margins.min()), time.perf_counter() - begun)
     _require_drivable(track, planned, margins)
+    if method != "centerline" and planned.min_margin < margin - 2.0 * TOLERANCE:
+        log.warning("%s: the line keeps %.3f m from the walls, not %.3f m", track.name, planned.min_margin, margin)
     return planned
 
 
@@ -100,16 +102,16 @@ def _least_curvature(track: Track, limits: Limits, margin: float) -> Path:
     from outlap.planning.min_curvature import min_curvature  # CasADi: not before it is needed
 
     log.info("%s: the line of least curvature", track.name)
-    path, kept = min_curvature(track, limits, margin), margin
+    path, asked = min_curvature(track, limits, margin), margin
     for _ in range(ROUNDS):
         short = margin - _nearest(track, path, limits)
         if short < TOLERANCE:
             break
         try:
-            path = min_curvature(track, limits, kept + short)
+            path = min_curvature(track, limits, asked + short)
         except OutlapError:
             break
-        kept += short
+        asked += short
     return path
 
 
@@ -117,11 +119,11 @@ def _least_time(track: Track, limits: Limits, margin: float, reference: Path, fr
     """The line of least time, found in rounds: each about the line before, with what that lacked in margin."""
     from outlap.planning.min_time import MinTimeProblem, spacing_for
 
-    path, kept = reference, margin
+    path, asked = reference, margin
     for number in range(1, ROUNDS + 1):
         log.info("%s: the line of least time, round %d", track.name, number)
         try:
-            problem = MinTimeProblem(track, path.resampled(spacing_for(path)), limits, kept, friction)
+            problem = MinTimeProblem(track, path.resampled(spacing_for(path)), limits, asked, friction)
             path = problem.solve(limits)
         except OutlapError:
             if number == 1:
@@ -130,7 +132,7 @@ def _least_time(track: Track, limits: Limits, margin: float, reference: Path, fr
         short = margin - _nearest(track, path, limits)
         if number > 1 and short < TOLERANCE:
             break
-        kept += max(short, 0.0)
+        asked += max(short, 0.0)
     return path
 
 
@@ -146,6 +148,11 @@ def _timed(track: Track, path: Path, limits: Limits, friction: FrictionMap | Non
     return path, speed, lap_time(speed, path.spacing)
 
 
+def _beyond_lock(path: Path, limits: Limits) -> bool:
+    """Whether a line turns more tightly than a car at full lock, by more than what sampling makes of a curvature."""
+    return float(np.abs(path.curvature).max()) > 1.02 * limits.max_curvature
+
+
 def _require_drivable(track: Track, planned: PlannedLine, margins: np.ndarray) -> None:
     path, limits = planned.path, planned.limits
     worst = int(margins.argmin())
@@ -155,8 +162,8 @@ def _require_drivable(track: Track, planned: PlannedLine, margins: np.ndarray) -
             f"track {track.name}: on the {planned.method} line the car touches a wall at s = {s:.1f} m; take a larger "
             "margin, or another method"
         )
-    sharpest = int(np.abs(path.curvature).argmax())
-    if planned.method != "centerline" and abs(path.curvature[sharpest]) > 1.02 * limits.max_curvature:
+    if planned.method != "centerline" and _beyond_lock(path, limits):
+        sharpest = int(np.abs(path.curvature).argmax())
         s = float(track.centerline.to_frenet(*path.points[sharpest])[0])
         raise OutlapError(
             f"track {track.name}: at s = {s:.1f} m the {planned.method} line has a curvature of "

@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from outlap.planning.limits import GRAVITY, Limits
+from outlap.planning.limits import Limits
+from outlap.simulator.bicycle import GRAVITY
 
 LOWEST_SPEED = 0.1  # [m/s] where a line would turn on the spot
 

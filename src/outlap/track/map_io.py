@@ -151,7 +151,7 @@ def read_raceline_csv(path: str | os.PathLike[str]) -> Raceline:
 
 def read_number_columns(path: str | os.PathLike[str], columns: tuple[str, ...]) -> np.ndarray:
     """The numbers (rows, columns) of a csv with these columns, and , or ; between them; comments are left out."""
-    return _read_csv(Path(path), columns)[0]
+    return _read_csv(Path(path), columns, least=1)[0]
 
 
 def write_raceline_csv(line: Raceline, path: str | os.PathLike[str]) -> Path:
@@ -209,7 +209,7 @@ def _read_centerline_columns(path: Path) -> tuple[np.ndarray, np.ndarray, np.nda
     return rows[:, :2], rows[:, 2], rows[:, 3]
 
 
-def _read_csv(path: Path, columns: tuple[str, ...]) -> tuple[np.ndarray, list[int]]:
+def _read_csv(path: Path, columns: tuple[str, ...], least: int = MIN_POINTS) -> tuple[np.ndarray, list[int]]:
     """The numbers (rows, columns) of a csv with , or ; between them, and the line each row stood in."""
     rows: list[list[float]] = []
     lines: list[int] = []
@@ -230,8 +230,8 @@ def _read_csv(path: Path, columns: tuple[str, ...]) -> tuple[np.ndarray, list[in
             row.append(number)
         rows.append(row)
         lines.append(line)
-    if len(rows) < MIN_POINTS:
-        raise OutlapError(f"{path}: has {len(rows)} points; it must have at least {MIN_POINTS} rows of {expected}")
+    if len(rows) < least:
+        raise OutlapError(f"{path}: has {len(rows)} points; it must have at least {least} rows of {expected}")
     return np.array(rows), lines
 
 
