@@ -43,7 +43,7 @@ def test_on_a_straight_line_it_steers_straight_at_the_lines_speed():
 @pytest.mark.parametrize("radius", [-4.0, 3.0])
 def test_on_a_circle_it_steers_the_circles_curvature(radius):
     arc = line(lambda s: radius * np.sin(s / radius), lambda s: radius * (1 - np.cos(s / radius)))
-    steer, _ = pursue(arc, yaw_rate=2.0 / radius, understeer=0.0)
+    steer, _ = pursue(arc, yaw_rate=2.0 / radius, lookahead=1.0, **PLAIN)
     assert steer == pytest.approx(math.atan(0.33 / radius) / 0.4, rel=0.02)
 
 
@@ -70,7 +70,7 @@ def test_far_from_the_line_it_looks_farther_ahead():
 
 
 def test_it_turns_towards_a_line_beside_it_and_less_so_the_faster_it_is():
-    beside = line(lambda s: s, lambda s: 0.0 * s + 0.3)
+    beside = line(lambda s: s, lambda s: 0.0 * s + 0.1)
     slow, fast = (pursue(beside, speed, yaw_rate_gain=0.0)[0] for speed in (0.0, 6.0))
     assert slow > 2.0 * fast > 0.0
 
