@@ -199,9 +199,14 @@ def test_ctrl_c_stops_the_solver_and_is_no_planning_error(circuit):
         "try:\n    plan.plan_line(track, Limits.of(VehicleParams()))\n"
         "except KeyboardInterrupt:\n    sys.exit(7)\n"
     )
-    # A test run in the background hands down an ignored SIGINT.
-    heard = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120, **heard).returncode == 7
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        check=False,
+        timeout=120,
+        # A test run in the background hands down an ignored SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert done.returncode == 7
 
 
 def test_limits_that_make_no_sense_are_refused():
