@@ -108,14 +108,13 @@ def _free_intervals(occupancy, frame, points, normal, radius, low, high):
             continue
         x, y = points[i]
         nx, ny = normal[i]
-        begin = min(max(0.0, low[i]), high[i])
+        nearest = min(max(0.0, low[i]), high[i])
+        begin = nearest
         k = 0
         while not _is_free(occupancy, frame, x + begin * nx, y + begin * ny, radius):
             k += 1
             away = LATERAL_STEP * ((k + 1) // 2) * (1.0 if k % 2 else -1.0)  # alternately left and right, ever farther
-            begin = min(max(0.0, low[i]), high[i]) + away
-            if begin < low[i] or begin > high[i]:
-                begin = min(max(begin, low[i]), high[i])
+            begin = min(max(nearest + away, low[i]), high[i])
             if abs(away) > high[i] - low[i] + LATERAL_STEP:
                 begin = np.nan
                 break
