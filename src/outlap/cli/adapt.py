@@ -89,7 +89,7 @@ class Adapt:
         from outlap.envs.tasks import load_tracks
         from outlap.envs.terminations import CRASH
         from outlap.evaluation.metrics import summarise_methods
-        from outlap.evaluation.results import prepare_folder, save_results
+        from outlap.evaluation.results import prepare_folder, save_results, write_rows
         from outlap.evaluation.rollout import evaluate, standing_starts
         from outlap.mql.adaptation import AdaptationSettings, adapt
         from outlap.mql.mql import MQL
@@ -138,7 +138,7 @@ class Adapt:
         summary = summarise_methods(everything)
         record = {**provenance(), "settings": self, "tracks": {track.name: track.fingerprint for track in tracks}}
         save_results(folder, everything, summary, record)
-        pd.concat(updates, ignore_index=True).to_parquet(folder / "updates.parquet", index=False)
+        write_rows(pd.concat(updates, ignore_index=True), folder / "updates.parquet")
         data = {**summary, "folder": folder}
         return CommandResult(data, lambda console: _print(console, data))
 

@@ -1,4 +1,4 @@
-"""`outlap train ppo` and `outlap train mql`."""
+"""`outlap train ppo | recurrent-ppo | mql`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from outlap.config import load_config
 from outlap.errors import OutlapError
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
+from outlap.training.recurrent_ppo import RecurrentPPOConfig
 from outlap.training.run import Run, load_run
 from outlap.training.session import Progress, TrainingConfig, train
 
@@ -73,6 +74,18 @@ class TrainPPO(_Train):
 
     config_class = PPOConfig
     settings: Annotated[PPOConfig, arg(name="")] = field(default_factory=PPOConfig)
+
+
+@dataclass(frozen=True)
+class TrainRecurrentPPO(_Train):
+    """Train a policy with RecurrentPPO: PPO with an LSTM, and domain randomization.
+
+    Any vehicle, sensor or actuator parameter given as two numbers is drawn anew at each reset:
+    --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
+    """
+
+    config_class = RecurrentPPOConfig
+    settings: Annotated[RecurrentPPOConfig, arg(name="")] = field(default_factory=RecurrentPPOConfig)
 
 
 @dataclass(frozen=True)

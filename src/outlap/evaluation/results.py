@@ -40,8 +40,13 @@ def save_results(folder: Path, rows: pd.DataFrame, summary: Mapping[str, Any], r
         summary: of `summarise`, as JSON.
         record: what is needed to repeat it, as JSON.
     """
-    buffer = io.BytesIO()
-    rows.to_parquet(buffer, index=False)
-    atomic_write(folder / ROWS, buffer.getvalue())
+    write_rows(rows, folder / ROWS)
     for name, content in ((SUMMARY, summary), (RECORD, record)):
         atomic_write(folder / name, to_json(content) + "\n")
+
+
+def write_rows(rows: pd.DataFrame, path: Path) -> None:
+    """Write rows as Parquet, beside their place and renamed."""
+    buffer = io.BytesIO()
+    rows.to_parquet(buffer, index=False)
+    atomic_write(path, buffer.getvalue())

@@ -58,6 +58,7 @@ def adapt(
     *,
     seed: int = 0,
     on_iteration: Callable[[int, MQLPolicy], None] | None = None,
+    on_weights: Callable[[np.ndarray, np.ndarray], None] | None = None,
 ) -> tuple[MQLPolicy, AdaptationRecord]:
     """A copy of the meta-policy, adapted to a task.
 
@@ -67,6 +68,9 @@ def adapt(
         settings: constants.
         seed: of everything that is drawn.
         on_iteration: called with the number of each iteration that is done, and the policy as it stands.
+        on_weights: called with the weights (n,) of each batch of the replay, before and after the clipping.
+
+    Where the transitions were collected already, equal seeds draw equal batches, whatever the clip rule.
 
     Raises OutlapError where there is no transition of either side.
     """
@@ -94,7 +98,7 @@ def adapt(
     for iteration in range(settings.iterations):
         if collector is not None:
             collector.collect(policy)
-        propensity = _fit(meta, new, settings, rng)
+        propensity = fit_to(meta, new, settings, rng)
         for _ in range(settings.on_task_steps):
             on_task = update(meta.draw(new, settings.batch_size, rng))
         first = len(record.updates)
@@ -103,6 +107,8 @@ def adapt(
             # Features are the meta-policy's throughout, so that β means one thing.
             raw = propensity.beta(features(meta.policy, batch))
             beta, level = clip.clip(raw)
+            if on_weights is not None:
+                on_weights(raw, beta)
             ess = effective_sample_size(beta)
             pull = settings.proximal * (1.0 - ess)
             weights = torch.as_tensor(beta, dtype=torch.float32, device=policy.device)
@@ -146,13 +152,22 @@ LOGGED = (
 )  # fmt: skip
 
 
+def collect(meta: MQL, env: VecEnv, settings: AdaptationSettings, *, seed: int = 0) -> HistoryBuffer:
+    """As many transitions of a task as an adaptation collects, all of them driven by the meta-policy."""
+    collector = _Collector(meta, env, settings, np.random.default_rng(seed))
+    for _ in range(settings.iterations):
+        collector.collect(meta.policy)
+    return collector.buffer
+
+
 def features(policy: MQLPolicy, batch: Batch) -> np.ndarray:
     """What the classifier sees of transitions: the context at their departure, (n, hidden)."""
     with torch.no_grad():
         return policy.encode(batch.windows.first(policy.history)).cpu().numpy()
 
 
-def _fit(meta: MQL, new: HistoryBuffer, settings: AdaptationSettings, rng: np.random.Generator) -> Propensity:
+def fit_to(meta: MQL, new: HistoryBuffer, settings: AdaptationSettings, rng: np.random.Generator) -> Propensity:
+    """The classifier between transitions of a new task and the replay of the meta-training."""
     sides = []
     for buffer in (new, meta.replay_buffer):
         size = min(settings.classifier_size, buffer.transitions())

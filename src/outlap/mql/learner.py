@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +23,38 @@ class TD3Settings:
     noise_clip: float = 0.5  # largest such noise
     policy_delay: int = 2  # updates of the critics for one of the actor and the targets
     max_grad_norm: float = 10.0
+
+
+class Criticism(NamedTuple):
+    """What the critics make of a batch."""
+
+    seen: dict[str, Tensor]  # (n, size) of each term
+    embedding: Tensor  # (n, size) of what is seen
+    context: Tensor  # (n, hidden)
+    values: Tensor  # (2, n)
+    errors: Tensor  # (n,) squared TD error of both critics together: the loss of every transition
+
+
+def criticise(policy: MQLPolicy, batch: Batch, settings: TD3Settings, noise: torch.Generator) -> Criticism:
+    """The critics' values and losses, with their gradients."""
+    device = policy.device
+    action, reward, discount = (to_tensor(x, device) for x in (batch.action, batch.reward, batch.discount))
+    seen = {name: to_tensor(batch.observation[name], device) for name in policy.critic.encoder.encoders}
+    seen_next = {name: to_tensor(batch.next_observation[name], device) for name in policy.critic.encoder.encoders}
+    context, context_next = _contexts(policy, batch)
+
+    with torch.no_grad():
+        embedding_next = policy.critic_target.encoder(seen_next)
+        chosen = policy.actor_target(
+            embedding_next if policy.shares_encoder else policy.actor_target.encoder(seen_next), context_next
+        )
+        jitter = torch.randn(chosen.shape, generator=noise, device=device) * settings.policy_noise
+        chosen = (chosen + jitter.clamp(-settings.noise_clip, settings.noise_clip)).clamp(-1.0, 1.0)
+        target = reward + discount * policy.critic_target(embedding_next, chosen, context_next).amin(0)
+
+    embedding = policy.critic.encoder(seen)
+    values = policy.critic(embedding, action, context)
+    return Criticism(seen, embedding, context, values, (values - target).square().sum(0))
 
 
 def td3_update(
@@ -54,23 +87,8 @@ def td3_update(
         What can be logged, without gradient: losses, the variance of the transitions' losses, the mean of Q, the
         distance ‖θ - anchor‖².
     """
-    device = policy.device
-    action, reward, discount = (to_tensor(x, device) for x in (batch.action, batch.reward, batch.discount))
-    seen = {name: to_tensor(batch.observation[name], device) for name in policy.critic.encoder.encoders}
-    seen_next = {name: to_tensor(batch.next_observation[name], device) for name in policy.critic.encoder.encoders}
-    context, context_next = _contexts(policy, batch)
-
-    with torch.no_grad():
-        embedding_next = policy.critic_target.encoder(seen_next)
-        shared = policy.shares_encoder
-        chosen = policy.actor_target(embedding_next if shared else policy.actor_target.encoder(seen_next), context_next)
-        jitter = torch.randn(chosen.shape, generator=noise, device=device) * settings.policy_noise
-        chosen = (chosen + jitter.clamp(-settings.noise_clip, settings.noise_clip)).clamp(-1.0, 1.0)
-        target = reward + discount * policy.critic_target(embedding_next, chosen, context_next).amin(0)
-
-    embedding = policy.critic.encoder(seen)
-    values = policy.critic(embedding, action, context)
-    each = (values - target).square().sum(0)
+    seen, embedding, context, values, each = criticise(policy, batch, settings, noise)
+    shared = policy.shares_encoder
     critic_loss = (each if weights is None else weights * each).mean()
     loss = critic_loss
     record = {}

@@ -10,7 +10,6 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.sharedctypes import SynchronizedArray
 from multiprocessing.synchronize import Event
@@ -27,10 +26,11 @@ from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
 from outlap.evaluation.rollout import evaluate, made_for, standing_starts
+from outlap.processes import process_environment
 from outlap.track.track import Track
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
-from outlap.training.session import Progress, train
+from outlap.training.session import train
 
 SLOWEST = 0.5  # [m/s] that an opponent can command; one that may stop would rather stand than enter a corner
 POLL = 0.5  # [s] between two looks at how far the trainings are
@@ -98,7 +98,7 @@ def train_population(
     context = multiprocessing.get_context("spawn")
     steps, stop = context.Array("q", len(plan.opponents)), context.Event()
     threads = max(1, cores // jobs)
-    with _environment(NUMBA_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads)):
+    with process_environment(NUMBA_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads)):
         pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(steps, stop, threads))
         # No more at a time than workers: those that wait in the pool could not be taken back.
         running: dict[Future[pd.DataFrame], int] = {}
@@ -183,26 +183,42 @@ def _start_worker(steps: Any, stop: Event, threads: int) -> None:
 
 def _train_and_verify(plan: Plan, number: int) -> pd.DataFrame:
     """Train one opponent, or go on with its training, and leave its files in the population's folder: in a worker."""
-    opponent = plan.opponents[number]
     parent = multiprocessing.parent_process()
 
-    def on_progress(progress: Progress) -> None:
+    def on_steps(steps: int) -> None:
         if _steps is not None:
-            _steps[number] = progress.steps
+            _steps[number] = steps
         if (_stop is not None and _stop.is_set()) or (parent is not None and not parent.is_alive()):
             raise KeyboardInterrupt  # nobody waits for this any more: save and go
 
-    config = opponent_config(plan.settings, plan.track_name, opponent.max_speed_mps)
     try:
-        run = train(
-            config, plan.folder / "runs" / opponent.name, resume=_begun(plan, opponent), on_progress=on_progress
-        )
+        return train_opponent(plan, plan.opponents[number], on_steps)
     except KeyboardInterrupt:
         if parent is not None and not parent.is_alive():
             os._exit(1)
         raise
-    if _steps is not None:
-        _steps[number] = plan.settings.total_steps
+
+
+def train_opponent(plan: Plan, opponent: Opponent, on_steps: Callable[[int], None]) -> pd.DataFrame:
+    """Train one opponent, or go on with its training, and leave its files in the plan's folder.
+
+    Args:
+        plan: of the population.
+        opponent: of the plan.
+        on_steps: called with the steps so far; may raise KeyboardInterrupt, which passes through once a checkpoint is
+            written.
+
+    Returns:
+        The rows of its verification.
+    """
+    config = opponent_config(plan.settings, plan.track_name, opponent.max_speed_mps)
+    run = train(
+        config,
+        plan.folder / "runs" / opponent.name,
+        resume=_begun(plan, opponent),
+        on_progress=lambda progress: on_steps(progress.steps),
+    )
+    on_steps(config.total_steps)
     from stable_baselines3 import PPO
 
     driver = MLPDriver.from_ppo(
@@ -211,18 +227,3 @@ def _train_and_verify(plan: Plan, number: int) -> pd.DataFrame:
     )  # fmt: skip
     driver.save(plan.folder / opponent.name)
     return verify(driver, plan.settings.env, plan.track, plan.laps, plan.starts)
-
-
-@contextmanager
-def _environment(**variables: str) -> Iterator[None]:
-    """Environment variables for the processes that are started meanwhile."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

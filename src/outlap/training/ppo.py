@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -12,7 +12,7 @@ from outlap.simulator.vehicle import LidarParams, VehicleParams
 from outlap.training.session import TrainingConfig
 
 if TYPE_CHECKING:
-    from stable_baselines3 import PPO
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
     from outlap.envs.sb3_vec_env import SB3VecEnv
 
@@ -45,34 +45,40 @@ class PPOConfig(TrainingConfig):
     activation: Literal["tanh", "relu"] = "tanh"
     log_std_init: float = -0.5  # log of the initial standard deviation of an action
 
-    def make_model(self, environment: SB3VecEnv) -> PPO:
+    def make_model(self, environment: SB3VecEnv) -> BaseAlgorithm:
         """See `TrainingConfig`."""
-        import torch
         from stable_baselines3 import PPO
 
-        return PPO(
-            "MultiInputPolicy",
-            environment,
-            learning_rate=self.schedule(),
-            n_steps=self.n_steps,
-            batch_size=self.batch_size,
-            n_epochs=self.n_epochs,
-            gamma=self.gamma,
-            gae_lambda=self.gae_lambda,
-            clip_range=self.clip_range,
-            ent_coef=self.ent_coef,
-            vf_coef=self.vf_coef,
-            max_grad_norm=self.max_grad_norm,
-            policy_kwargs={
-                "net_arch": list(self.net_arch),
-                "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.activation],
-                "log_std_init": self.log_std_init,
-            },
-            seed=self.seed,
-            device=self.device,
-        )
+        return PPO("MultiInputPolicy", environment, **self.constants(), policy_kwargs=self.network())
 
-    def model_class(self) -> type[PPO]:
+    def constants(self) -> dict[str, Any]:
+        """What the algorithm is built with, but its networks."""
+        return {
+            "learning_rate": self.schedule(),
+            "n_steps": self.n_steps,
+            "batch_size": self.batch_size,
+            "n_epochs": self.n_epochs,
+            "gamma": self.gamma,
+            "gae_lambda": self.gae_lambda,
+            "clip_range": self.clip_range,
+            "ent_coef": self.ent_coef,
+            "vf_coef": self.vf_coef,
+            "max_grad_norm": self.max_grad_norm,
+            "seed": self.seed,
+            "device": self.device,
+        }
+
+    def network(self) -> dict[str, Any]:
+        """Policy and value function."""
+        import torch
+
+        return {
+            "net_arch": list(self.net_arch),
+            "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.activation],
+            "log_std_init": self.log_std_init,
+        }
+
+    def model_class(self) -> type[BaseAlgorithm]:
         """See `TrainingConfig`."""
         from stable_baselines3 import PPO
 

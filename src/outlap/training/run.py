@@ -126,12 +126,18 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
     return Run(folder, validate(_config_class(content, path), content, str(path)))
 
 
-def _config_class(content: Any, path: Path) -> type[TrainingConfig]:
-    """The configuration of the algorithm that a file's content names; PPO's where it names none."""
+def config_classes() -> dict[str, type[TrainingConfig]]:
+    """The configuration of every algorithm, by its name."""
     from outlap.training.mql import MQLConfig
     from outlap.training.ppo import PPOConfig
+    from outlap.training.recurrent_ppo import RecurrentPPOConfig
 
-    classes: dict[str, type[TrainingConfig]] = {"ppo": PPOConfig, "mql": MQLConfig}
+    return {"ppo": PPOConfig, "recurrent-ppo": RecurrentPPOConfig, "mql": MQLConfig}
+
+
+def _config_class(content: Any, path: Path) -> type[TrainingConfig]:
+    """The configuration of the algorithm that a file's content names; PPO's where it names none."""
+    classes = config_classes()
     name = content.get("algorithm", "ppo") if isinstance(content, Mapping) else "ppo"
     if name not in classes:
         raise OutlapError(f"{path}: algorithm is {name!r:.60}; must be one of {', '.join(classes)}")

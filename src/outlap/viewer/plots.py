@@ -30,6 +30,13 @@ WIDTH = 7.0  # [inch] of the figure: the text width of a page
 MAX_MAP_PIXELS = 1600  # of the longer side of the drawn map
 
 
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of a size [inch] that can be saved without a display."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figure:
     """Map and curvature of a track: walls, centreline, start line, direction, racing line if there is one.
 
@@ -46,8 +53,7 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
     centerline = track.centerline
     low, high = _view(track)
     map_height = min(8.0, max(2.5, (WIDTH - 0.8) * (high[1] - low[1]) / (high[0] - low[0])))
-    figure = Figure(figsize=(WIDTH, map_height + 2.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(WIDTH, map_height + 2.6)
     map_axes, curvature_axes = figure.subplots(2, 1, height_ratios=(map_height, 1.5))
     marks = np.arange(0.0, centerline.length, _mark_spacing(centerline.length))
 
@@ -67,7 +73,7 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
     if path is not None:
-        _save(figure, path)
+        save_figure(figure, path)
     return figure
 
 
@@ -84,8 +90,7 @@ def draw_raceline(
     """
     low, high = _view(track)
     map_height = min(8.0, max(2.5, (WIDTH - 1.4) * (high[1] - low[1]) / (high[0] - low[0])))
-    figure = Figure(figsize=(WIDTH, map_height + 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(WIDTH, map_height + 3.2)
     map_axes, speed_axes, grip_axes = figure.subplots(3, 1, height_ratios=(map_height, 1.2, 1.2))
     length = float(line.s[-1] + np.hypot(line.x[0] - line.x[-1], line.y[0] - line.y[-1]))
     lap = "" if lap_time is None else f", lap {lap_time:.2f} s"
@@ -111,11 +116,11 @@ def draw_raceline(
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
     if path is not None:
-        _save(figure, path)
+        save_figure(figure, path)
     return figure
 
 
-def _save(figure: Figure, path: str | os.PathLike[str]) -> None:
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure beside its place and rename it. Raises OutlapError for an ending that Matplotlib cannot write."""
     ending = Path(path).suffix.lstrip(".").lower()
     if ending not in figure.canvas.get_supported_filetypes():

@@ -1,0 +1,142 @@
+"""`outlap reproduce`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from outlap.cli.arguments import check_least
+from outlap.cli.output import CommandResult
+from outlap.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
+    from outlap.experiments.units import Unit
+
+
+SHOWN = {"overtakes": "overtakes in 500", "crashes": "crashes in 500", "progress_m": "progress [m]"}
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Make the paper's tables and figures: train what is missing, adapt, race, and write a report.
+
+    Whatever is done is kept in --out: the same command goes on after a kill, and a changed configuration does anew
+    only what depends on it. Real circuits are taken where they can be found, see `outlap tracks list`.
+    """
+
+    wanted: Annotated[Positional[tuple[str, ...]], arg(metavar="table-1|table-2|table-3|figure-2|appendix|all")]
+    """What to make. Also vehicles, everything, and task sets of your own (.yaml)."""
+
+    budget: str = "cpu"
+    """How much of everything: smoke (minutes), cpu (three hours on two cores), paper (days), or a .yaml file."""
+
+    methods: tuple[str, ...] = ()
+    """Names or .yaml files; by default all that come with outlap."""
+
+    seeds: int | None = None
+    """Trainings of every method, in place of the budget's."""
+
+    jobs: int = 0
+    """Units of work at a time; 0: one a core."""
+
+    out: Path | None = None
+    """The folder for the report and the work; by default runs/reproduce-BUDGET."""
+
+    dry_run: FlagCreatePairsOff[bool] = False
+    """Say what there is to do, and do nothing."""
+
+    quiet: FlagCreatePairsOff[bool] = False
+    """Show no progress."""
+
+    json: str | None = None
+    """Write the result as JSON to this file; - for standard output."""
+
+    def run(self) -> CommandResult:
+        from outlap.experiments.plan import make_plan
+        from outlap.experiments.report import write_report
+        from outlap.experiments.runner import Status, run_units
+
+        check_least("--jobs", self.jobs, 0)
+        check_least("--seeds", 1 if self.seeds is None else self.seeds, 1)
+        plan = make_plan(self.wanted, self.budget, self.methods, self.seeds)
+        folder = self.out or Path("runs") / f"reproduce-{plan.budget_name}"
+        work = folder / "work"
+        units = plan.units
+        missing = [unit for unit in units if not unit.is_done(work)]
+        if self.dry_run:
+            return _dry(units, missing, self.jobs)
+        with progress_bar("reproducing", 1000, "‰", self.quiet) as update:
+
+            def show(status: Status) -> None:
+                note = f"{status.done} of {status.units} units"
+                if status.running:
+                    note += f", {_duration(status.seconds_left)} left: {', '.join(status.running)}"
+                update(round(1000 * status.work_done / status.work), note)
+
+            try:
+                run_units(units, work, self.jobs, show)
+            except KeyboardInterrupt:
+                print("\nsaved; go on with the same command", file=sys.stderr)
+                raise
+        data = write_report(plan, folder)
+        return CommandResult({**data, "folder": folder}, lambda console: _print(console, data, folder))
+
+
+def _cell(entry: Mapping[str, Any]) -> Text:
+    from rich.text import Text
+
+    text = f"{entry['value']:.0f}"
+    if entry["low"] == entry["low"]:  # one seed has no interval
+        text += f" [{entry['low']:.0f}, {entry['high']:.0f}]"
+    return Text(text + (f" ({entry['published']:g})" if isinstance(entry["published"], (int, float)) else ""))
+
+
+def _dry(units: Sequence[Unit], missing: Sequence[Unit], jobs: int) -> CommandResult:
+    seconds = sum(unit.seconds for unit in missing) / (jobs or os.cpu_count() or 1)
+    kinds = {kind: [unit for unit in missing if unit.kind == kind] for kind in dict.fromkeys(u.kind for u in units)}
+    data = {
+        "units": len(units),
+        "missing": {kind: len(found) for kind, found in kinds.items()},
+        "estimated_seconds": round(seconds),
+    }
+
+    def show(console: Console) -> None:
+        for kind, found in kinds.items():
+            console.print(f"{len(found):5} {kind}", highlight=False)
+        console.print(
+            f"about {_duration(seconds)}; {len(units) - len(missing)} of {len(units)} are done", highlight=False
+        )
+
+    return CommandResult(data, show)
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60.0)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{max(minutes, 1)} min"
+
+
+def _print(console: Console, data: Mapping[str, Any], folder: Path) -> None:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    for name, methods in data["tables"].items():
+        metrics = [metric for metric in SHOWN if metric in next(iter(methods.values()))]
+        table = Table(box=box.SIMPLE_HEAD, title=name, title_justify="left")
+        table.add_column("method")
+        for metric in metrics:
+            table.add_column(Text(SHOWN[metric]), justify="right")
+        for method, row in methods.items():
+            table.add_row(Text(method), *(_cell(row[metric]) for metric in metrics))
+        console.print(table)
+    console.print("mean over seeds [95 % interval], (the paper)", style="dim", highlight=False, markup=False)
+    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,181 @@
+"""Any runs raced against each other on the same episodes.
+
+Runs whose configurations differ in nothing but the seed are trainings of one method. Where every method has two or
+more, the seed is the unit of the intervals; else it is the episode, and they hold for these very policies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from outlap.drivers.driver import Driver
+from outlap.evaluation.results import ROWS, write_rows
+from outlap.evaluation.statistics import Estimate, estimate_mean, paired_difference, wilson_interval
+from outlap.experiments.document import Document
+from outlap.experiments.figures import draw_intervals
+from outlap.experiments.results import METRICS, PAPER_EPISODES, RACING, claim_of, seed_scores
+from outlap.files import atomic_write, to_json
+from outlap.training.run import Run
+
+SKIPPED = ("episode_length", "reward")  # of the paper's short races
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A driver with the seed of its training."""
+
+    name: str
+    driver: Driver
+    run: Run | None
+
+    @property
+    def method(self) -> str:
+        """What its configuration says but for the seed; of one that was not trained, its name."""
+        if self.run is None:
+            return self.name
+        content = self.run.config.model_dump(mode="json")
+        return to_json({name: value for name, value in content.items() if name not in ("seed", "threads", "device")})
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A method against the first one, in one metric."""
+
+    metric: str
+    method: str
+    other: str
+    difference: float
+    low: float
+    high: float
+    claim: str
+
+
+def group(subjects: Sequence[Subject]) -> dict[str, list[Subject]]:
+    """Subjects by method; a method is called by its first run, and by how many there are."""
+    found: dict[str, list[Subject]] = {}
+    for subject in subjects:
+        found.setdefault(subject.method, []).append(subject)
+    labels = [each[0].name + (f" ({len(each)} seeds)" if len(each) > 1 else "") for each in found.values()]
+    return {
+        label if labels.count(label) == 1 else f"{label} #{number + 1}": each
+        for number, (label, each) in enumerate(zip(labels, found.values(), strict=True))
+    }
+
+
+def compare(rows: pd.DataFrame, methods: Sequence[str], alone: bool) -> tuple[dict[str, Any], list[Difference], bool]:
+    """The numbers of every method, and its differences from the first one.
+
+    Args:
+        rows: with `method`, `training_seed` (a number for each run of a method), `task` and `seed`.
+        methods: their names, the first one being what the others are compared with.
+        alone: without other cars.
+
+    Returns:
+        Estimates by method and metric; the differences; whether the seed is the unit.
+    """
+    metrics = [name for name in METRICS if name not in SKIPPED and not (alone and name in RACING)]
+    of_method = {method: rows.loc[rows["method"] == method] for method in methods}
+    counts = {method: len(np.unique(mine["training_seed"].to_numpy())) for method, mine in of_method.items()}
+    by_seed = min(counts.values()) > 1
+    cells: dict[str, Any] = {method: {} for method in methods}
+    differences = []
+    for metric in metrics:
+        values = {method: _values(mine, metric, by_seed) for method, mine in of_method.items()}
+        for method in methods:
+            cells[method][metric] = estimate_mean(values[method].mean(axis=1))
+        if metric == "crashes" and not by_seed:
+            for method, mine in of_method.items():
+                cells[method][metric] = _of_crashes(mine, cells[method][metric])
+        first = methods[0]
+        for method in methods[1:] if METRICS[metric].better else ():
+            paired = not by_seed or counts[method] == counts[first]
+            estimate = _difference(values[method], values[first], paired)
+            better = METRICS[metric].better
+            claim = claim_of(better * estimate.low, better * estimate.high)
+            differences.append(Difference(metric, method, first, estimate.mean, estimate.low, estimate.high, claim))
+    return cells, differences, by_seed
+
+
+def _values(rows: pd.DataFrame, metric: str, by_seed: bool) -> np.ndarray:
+    """(seeds, tasks), or (episodes, 1) in which the runs of a method are averaged."""
+    if by_seed:
+        return seed_scores(rows, METRICS[metric])
+    each = pd.DataFrame({"task": rows["task"], "seed": rows["seed"], "value": METRICS[metric].values(rows)})
+    return each.pivot_table(index=["task", "seed"], values="value", aggfunc="mean").to_numpy(np.float64)
+
+
+def _of_crashes(rows: pd.DataFrame, estimate: Estimate) -> Estimate:
+    """The estimate with Wilson's interval, which has a width for no crash too."""
+    crashed = METRICS["crashes"].of_rows(rows)
+    low, high = wilson_interval(int(crashed.sum()), len(crashed))
+    return estimate._replace(low=PAPER_EPISODES * low, high=PAPER_EPISODES * high)
+
+
+def _difference(a: np.ndarray, b: np.ndarray, paired: bool) -> Estimate:
+    if paired:
+        return paired_difference(a, b)
+    # Welch's interval: other numbers of seeds cannot be paired.
+    from scipy import stats
+
+    left, right = a.mean(axis=1), b.mean(axis=1)
+    low, high = stats.ttest_ind(left, right, equal_var=False).confidence_interval()
+    return Estimate(float(left.mean() - right.mean()), float("nan"), float(low), float(high))
+
+
+def write_comparison(
+    folder: Path, rows: pd.DataFrame, groups: Mapping[str, Sequence[Subject]], alone: bool, record: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Write `report.md`, `report.html`, `results.json`, the figure and the rows; returns what the JSON holds."""
+    methods = list(groups)
+    cells, differences, by_seed = compare(rows, methods, alone)
+    document = Document(folder)
+    document.text(f"# {', '.join(methods)}")
+    episodes = len(rows) // sum(len(each) for each in groups.values())
+    unit = "the seed of a training" if by_seed else "the episode: it says nothing of other trainings of a method"
+    tracks = ", ".join(dict.fromkeys(rows["task"].tolist()))
+    document.text(f"{episodes} episodes on {tracks}, the same for everybody. The unit of intervals is {unit}.")
+    metrics = list(next(iter(cells.values())))
+    document.table(
+        ["method", *(METRICS[metric].heading for metric in metrics)],
+        [[method, *(_cell(cells[method][metric], METRICS[metric].digits) for metric in metrics)] for method in methods],
+    )
+    document.figure("comparison", draw_intervals(cells, ("crashes", "progress_m")))
+    document.table(
+        ["comparison", "metric", "difference [95 %]", "shown"],
+        [
+            [
+                f"{each.method} against {each.other}",
+                METRICS[each.metric].heading,
+                _signed(each, METRICS[each.metric].digits),
+                each.claim,
+            ]
+            for each in differences
+        ],
+    )
+    data = {
+        "unit": "seed" if by_seed else "episode",
+        "methods": {method: {name: each._asdict() for name, each in row.items()} for method, row in cells.items()},
+        "differences": [asdict(each) for each in differences],
+        "runs": {method: [each.name for each in subjects] for method, subjects in groups.items()},
+        "record": record,
+    }
+    write_rows(rows, folder / ROWS)
+    atomic_write(folder / "results.json", to_json(data) + "\n")
+    document.save(", ".join(methods))
+    return data
+
+
+def _cell(estimate: Estimate, digits: int) -> str:
+    interval = "" if np.isnan(estimate.low) else f" [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+    return f"{estimate.mean:.{digits}f}{interval}"
+
+
+def _signed(each: Difference, digits: int) -> str:
+    interval = "" if np.isnan(each.low) else f" [{each.low:.{digits}f}, {each.high:.{digits}f}]"
+    return f"{each.difference:+.{digits}f}{interval}"

@@ -1,0 +1,234 @@
+"""The figures of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from outlap.evaluation.statistics import performance_profile
+from outlap.experiments.results import METRICS, TableResult
+from outlap.viewer.plots import INK, WIDTH, new_figure
+
+# Okabe and Ito's palette, in an order that keeps neighbours apart.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+MARKERS = "osD^vP*X"
+RULES = {"none": "no clip", "fixed": "fixed clip", "abc": "ABC", "uniform": "β = 1"}
+RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uniform": COLOURS[7]}
+POINTS = 60  # of a learning curve
+
+
+class Interval(Protocol):
+    """A mean with the ends of its interval."""
+
+    @property
+    def mean(self) -> float: ...
+    @property
+    def low(self) -> float: ...
+    @property
+    def high(self) -> float: ...
+
+
+def draw_intervals(
+    cells: Mapping[str, Mapping[str, Interval]],
+    metrics: Sequence[str],
+    titles: Mapping[str, str] | None = None,
+    title: str = "",
+) -> Figure:
+    """Numbers of every method as points with their intervals, what the paper has beside them as crosses.
+
+    Args:
+        cells: by method and metric.
+        metrics: a panel each.
+        titles: of methods; by default their names.
+        title: of the figure.
+    """
+    figure = new_figure(WIDTH, 0.9 + 0.34 * len(cells))
+    panels = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
+    heights = range(len(cells) - 1, -1, -1)
+    published = False
+    for axes, metric in zip(panels, metrics, strict=True):
+        for height, (row, colour) in zip(heights, zip(cells.values(), _cycle(COLOURS), strict=False), strict=True):
+            cell = row[metric]
+            axes.plot([cell.low, cell.high], [height, height], color=colour, linewidth=1.6, solid_capstyle="butt")
+            axes.plot(cell.mean, height, "o", color=colour, markersize=5)
+            paper = getattr(cell, "published", None)
+            if isinstance(paper, (int, float)):
+                axes.plot(paper, height, "x", color=INK, markersize=6)
+                published = True
+        axes.set_xlabel(METRICS[metric].heading, fontsize=8)
+    panels[0].set_yticks(heights, [(titles or {}).get(method, method) for method in cells], fontsize=8)
+    if published:
+        mark = Line2D([], [], color=INK, marker="x", linestyle="none", markersize=6, label="the paper")
+        figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=7)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    _tidy(*panels)
+    return figure
+
+
+def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str]) -> Figure:
+    """The share of seeds and tasks that come further than a share of what top speed would give."""
+    columns = min(3, len(results))
+    rows = -(-len(results) // columns)
+    figure = new_figure(WIDTH, 0.8 + 2.2 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    thresholds = np.linspace(0.0, 1.0, 201)
+    for axes, result in zip(grid.ravel(), results, strict=False):
+        for (method, scores), colour in zip(result.scores.items(), _cycle(COLOURS), strict=False):
+            axes.plot(
+                thresholds, performance_profile(scores, thresholds), color=colour, linewidth=1.2, label=titles[method]
+            )
+        axes.set_title(result.plan.name, loc="left", fontsize=9)
+        axes.set_xlabel("τ: progress over top speed × time", fontsize=7)
+    for axes in grid.ravel()[len(results) :]:
+        axes.set_visible(False)
+    grid[0, 0].set_ylabel("share above τ", fontsize=8)
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=7
+    )
+    _tidy(*grid.ravel())
+    return figure
+
+
+def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> Figure:
+    """Return and crash rate of trainings over their steps: mean over seeds, with the range that seeds span.
+
+    Args:
+        curves: of every label, one table a seed with `step`, `episode_return` and `crash_rate`.
+        title: of the figure.
+    """
+    figure = new_figure(WIDTH, 2.7)
+    returns, crashes = figure.subplots(1, 2)
+    for (label, seeds), colour in zip(curves.items(), _cycle(COLOURS), strict=False):
+        seeds = [seed for seed in seeds if len(seed)]
+        if not seeds:
+            continue
+        steps = np.linspace(0.0, min(seed["step"].to_numpy()[-1] for seed in seeds), POINTS)
+        for axes, name in ((returns, "episode_return"), (crashes, "crash_rate")):
+            each = np.array([np.interp(steps, seed["step"].to_numpy(), seed[name].to_numpy()) for seed in seeds])
+            axes.plot(steps / 1e6, each.mean(axis=0), color=colour, linewidth=1.2, label=label)
+            if len(each) > 1:
+                axes.fill_between(steps / 1e6, each.min(axis=0), each.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+    returns.set_ylabel("return of recent episodes", fontsize=8)
+    crashes.set(ylim=(0.0, 1.0))
+    crashes.set_ylabel("share of them that crash", fontsize=8)
+    for axes in (returns, crashes):
+        axes.set_xlabel("actions [million]", fontsize=8)
+    if len(curves) > 1:
+        figure.legend(
+            *returns.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=7
+        )
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    _tidy(returns, crashes)
+    return figure
+
+
+def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame) -> Figure:
+    """The paper's figure 2, and what remains of it once weights are made comparable.
+
+    Args:
+        updates: of `clipping.compare_rules`, with `adaptation_seed`.
+        gradients: likewise.
+    """
+    figure = new_figure(WIDTH, 5.0)
+    grid = figure.subplots(2, 3)
+    panels = (
+        ("critic_loss", "weighted critic loss", True),
+        ("critic_loss_variance", "its variance over the batch", True),
+        ("effective_sample_size", "effective sample size", False),
+        ("td_error", "unweighted TD error", False),
+        ("clipped_share", "share of weights clipped", False),
+    )
+    for axes, (name, label, log) in zip(grid.ravel(), panels, strict=False):
+        for rule, mine in updates.groupby("rule", sort=False):
+            by_seed = mine.pivot_table(index="adaptation_seed", columns="update", values=name).to_numpy(np.float64)
+            middle = np.median(by_seed, axis=0)
+            axes.plot(middle, color=RULE_COLOURS[str(rule)], linewidth=1.0, label=RULES[str(rule)])
+            if len(by_seed) > 1:
+                low, high = np.quantile(by_seed, [0.25, 0.75], axis=0)
+                axes.fill_between(
+                    np.arange(len(middle)), low, high, color=RULE_COLOURS[str(rule)], alpha=0.18, linewidth=0
+                )
+        if log:
+            axes.set_yscale("log")
+        axes.set_title(label, loc="left", fontsize=8)
+        axes.set_xlabel("replay update", fontsize=7)
+    axes = grid[1, 2]
+    for place, rule in enumerate(RULES):
+        values = gradients.loc[gradients["rule"] == rule].sort_values("adaptation_seed")["gradient_variance"].to_numpy()
+        reference = (
+            gradients.loc[gradients["rule"] == "uniform"].sort_values("adaptation_seed")["gradient_variance"].to_numpy()
+        )
+        ratio = values / reference
+        axes.plot(
+            np.full(len(ratio), place) + np.linspace(-0.15, 0.15, len(ratio)), ratio, ".", color=RULE_COLOURS[rule]
+        )
+        axes.plot(place, float(np.median(ratio)), "_", color=INK, markersize=14)
+    axes.set_yscale("log")
+    axes.set_xticks(range(len(RULES)), list(RULES.values()), fontsize=7)
+    axes.set_title("gradient variance (mean β 1),\nover that of β = 1", loc="left", fontsize=8)
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
+    )
+    _tidy(*grid.ravel())
+    return figure
+
+
+def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame) -> Figure:
+    """β before and after ABC during adaptations: how they are distributed, and their largest over the updates."""
+    figure = new_figure(WIDTH, 2.9)
+    spread, largest = figure.subplots(1, 2)
+    mine = histograms.loc[histograms["rule"] == "abc"].groupby("log10_beta")[["before", "after"]].sum()
+    edges = mine.index.to_numpy(np.float64)
+    width = float(edges[1] - edges[0])
+    for name, label, colour in (("before", "β", COLOURS[7]), ("after", "β clipped by ABC", COLOURS[1])):
+        counts = mine[name].to_numpy(np.float64)
+        spread.step(edges + width, np.maximum(counts, 0.5), where="pre", color=colour, linewidth=1.2, label=label)
+    used = np.flatnonzero(mine["before"].to_numpy() > 0)
+    spread.set(yscale="log", xlim=(edges[used[0]] - width, edges[used[-1]] + 2 * width))
+    spread.set_xlabel("log10 β", fontsize=8)
+    spread.set_ylabel("transitions", fontsize=8)
+    spread.legend(fontsize=7, frameon=False)
+    abc = updates.loc[updates["rule"] == "abc"]
+    for name, label, colour in (
+        ("beta_max", "largest β of a batch", COLOURS[7]),
+        ("clipped_beta_max", "after ABC", COLOURS[1]),
+        ("clip_level", "ABC's level", INK),
+    ):
+        by_seed = abc.pivot_table(index="adaptation_seed", columns="update", values=name).to_numpy(np.float64)
+        largest.plot(np.median(by_seed, axis=0), color=colour, linewidth=1.0, label=label)
+    largest.set(yscale="log")
+    largest.set_xlabel("replay update (median over adaptations)", fontsize=8)
+    largest.legend(fontsize=7, frameon=False)
+    _tidy(spread, largest)
+    return figure
+
+
+def read_learning(folder: Path) -> pd.DataFrame:
+    """A run's learning curve from its TensorBoard log: `step`, `episode_return`, `crash_rate`; empty without one."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    names = {"episode_return": "race/episode_return", "crash_rate": "race/crash_rate"}
+    log = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0})
+    log.Reload()
+    if not set(names.values()) <= set(log.Tags()["scalars"]):
+        return pd.DataFrame(columns=["step", *names])
+    columns = {name: {event.step: event.value for event in log.Scalars(tag)} for name, tag in names.items()}
+    return pd.DataFrame(columns).rename_axis("step").sort_index().reset_index()
+
+
+def _cycle(colours: Sequence[str]) -> list[str]:
+    return list(colours) * 4
+
+
+def _tidy(*axes: Axes) -> None:
+    for each in axes:
+        each.spines[["top", "right"]].set_visible(False)
+        each.tick_params(which="both", labelsize=7)

@@ -1,0 +1,307 @@
+"""The report: one folder with Markdown, a single-file page, figures, JSON, and every episode's row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from outlap.evaluation.results import ROWS, write_rows
+from outlap.experiments import figures
+from outlap.experiments.document import Document
+from outlap.experiments.plan import Plan
+from outlap.experiments.results import (
+    METRICS,
+    Cell,
+    Comparison,
+    TableResult,
+    entries,
+    ratio_over_adaptations,
+    read_rows,
+    table_result,
+)
+from outlap.experiments.units import OpponentUnit, done_record
+from outlap.files import atomic_write, to_json
+from outlap.training.run import provenance
+
+APPENDIX_TITLES = {
+    ("opponents", "vanilla-dr"): "Appendix B: Vanilla DR learns against opponents",
+    ("opponents", "mql-abc"): "Appendix C: MQL is meta-trained against opponents",
+    ("tracks", "vanilla-dr"): "Appendix E: Vanilla DR learns many tracks",
+    ("tracks", "mql-abc"): "Appendix F: MQL is meta-trained on many tracks",
+}
+PAPER_RATIO = 2.23e-6 / 8.40e-7  # of the critic loss's variance without ABC to that with it
+
+
+def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
+    """Write the report of a plan whose units are all done.
+
+    Args:
+        plan: what was made.
+        folder: for the report; `folder/work` holds the units.
+
+    Returns:
+        What `results.json` holds.
+    """
+    work = folder / "work"
+    titles = {name: method.title for name, method in plan.methods.items()}
+    rows = read_rows(plan, work)
+    results = [table_result(plan, table, rows) for table in plan.tables]
+    document = Document(folder)
+    document.text(f"# outlap: the paper's experiments, budget `{plan.budget_name}`")
+    document.text(_introduction(plan, work))
+    for result in results:
+        _write_table(document, plan, result, titles)
+    if len(results) > 0:
+        document.text("## How far every method comes")
+        document.text(
+            "Performance profiles: the share of trainings and tasks whose mean progress, as a share of what top speed "
+            "would give in the time, is above τ."
+        )
+        document.figure("profiles", figures.draw_profiles(results, titles))
+    data: dict[str, Any] = {"tables": {result.plan.name: entries(result) for result in results}}
+    data["comparisons"] = {result.plan.name: [asdict(each) for each in result.comparisons] for result in results}
+    if plan.clipping:
+        data["figure-2"] = _write_clipping(document, plan, work)
+    if plan.curves:
+        _write_appendix(document, plan, work)
+    record = {
+        **provenance(),
+        "core_seconds": _core_seconds(plan, work),
+        "budget": plan.budget,
+        "methods": plan.methods,
+        "task_sets": plan.task_sets,
+        "circuits": {table.name: table.circuits for table in plan.tables},
+    }
+    _write_record(document, plan, record)
+    data["record"] = record
+    if len(rows):
+        write_rows(rows, folder / ROWS)
+    atomic_write(folder / "results.json", to_json(data) + "\n")
+    document.save(f"outlap: the paper's experiments ({plan.budget_name})")
+    return data
+
+
+def _introduction(plan: Plan, work: Path) -> str:
+    budget = plan.budget
+    hours = sum(_core_seconds(plan, work).values()) / 3600.0
+    trainings = "1 training" if budget.seeds == 1 else f"{budget.seeds} trainings"
+    return (
+        f"Budget `{plan.budget_name}`: {budget.title}; {trainings} of every method, {hours:.1f} core hours of work.\n\n"
+        "How to read the tables: a number is the mean over trainings with different seeds; in brackets is Student's "
+        "95 % interval of that mean, whose unit is the seed. The sd is over episodes, as in the paper. A comparison is "
+        "paired by seed and task, and says `better` or `worse` only where the interval of the difference leaves out "
+        "zero; intervals are not corrected for the number of comparisons."
+    )
+
+
+def _write_table(document: Document, plan: Plan, result: TableResult, titles: Mapping[str, str]) -> None:
+    table = result.plan
+    race = table.races[0]
+    circuits = table.circuits
+    document.text(f"## {result.title}; {circuits.title}")
+    names = ", ".join(dict.fromkeys(task.track for task in race.tasks))
+    document.text(
+        f"{len(race.tasks)} tasks on {names}; {race.episodes} races of {race.time_limit:g} s on each, for every method "
+        "and training."
+    )
+    paper = [
+        metric for metric in result.metrics if any(row[metric].published is not None for row in result.cells.values())
+    ]
+    ours = [metric for metric in result.metrics if metric not in paper]
+    if paper:
+        headings = ["method"]
+        for metric in paper:
+            headings += [METRICS[metric].heading, "the paper"]
+        rows = []
+        for method, row in result.cells.items():
+            line = [titles[method]]
+            for metric in paper:
+                line += [_value(row[metric], metric), _published(row[metric], metric)]
+            rows.append(line)
+        document.table(headings, rows)
+    document.table(
+        ["method", *(METRICS[metric].heading for metric in ours), "IQM of progress [m]"],
+        [
+            [titles[method], *(_value(row[metric], metric) for metric in ours), _iqm(row["progress_m"])]
+            for method, row in result.cells.items()
+        ],
+    )
+    document.figure(table.name, figures.draw_intervals(result.cells, ("crashes", "progress_m"), titles, result.title))
+    if result.comparisons:
+        document.text("### What this shows")
+        document.table(
+            ["comparison", "metric", "difference [95 %]", "probability of improvement [95 %]", "shown"],
+            [_comparison(each, titles) for each in result.comparisons],
+        )
+
+
+def _value(cell: Cell, metric: str) -> str:
+    digits = METRICS[metric].digits
+    text = f"{cell.mean:.{digits}f}"
+    if not METRICS[metric].per_paper_episodes:
+        text += f" ± {cell.sd:.{digits}f}"
+    return f"{text} {_interval(cell.low, cell.high, digits)}"
+
+
+def _interval(low: float, high: float, digits: int) -> str:
+    return "" if low != low else f"[{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def _published(cell: Cell, metric: str) -> str:
+    if cell.published is None:
+        return ""
+    if isinstance(cell.published, tuple):
+        return f"{cell.published[0]:g} ± {cell.published[1]:g}"
+    return f"{cell.published:g}"
+
+
+def _iqm(cell: Cell) -> str:
+    return f"{cell.iqm:.1f} {_interval(cell.iqm_low, cell.iqm_high, 1)}"
+
+
+def _comparison(each: Comparison, titles: Mapping[str, str]) -> list[str]:
+    digits = METRICS[each.metric].digits
+    return [
+        f"{titles[each.method]} against {titles[each.other]}",
+        METRICS[each.metric].heading,
+        f"{each.difference:+.{digits}f} {_interval(each.low, each.high, digits)}",
+        f"{each.probability:.2f} {_interval(each.probability_low, each.probability_high, 2)}",
+        f"**{each.claim}**" if each.claim != "not shown" else each.claim,
+    ]
+
+
+def _read_clipping(plan: Plan, work: Path, name: str) -> pd.DataFrame:
+    return pd.concat(
+        [pd.read_parquet(unit.folder(work) / f"{name}.parquet") for unit in plan.clipping], ignore_index=True
+    )
+
+
+def _write_clipping(document: Document, plan: Plan, work: Path) -> dict[str, Any]:
+    updates, gradients = _read_clipping(plan, work, "updates"), _read_clipping(plan, work, "gradients")
+    document.text("## Figure 2: what clipping does to adaptation")
+    document.text(
+        f"{len(plan.clipping)} adaptations to unseen circuits; for every clip rule the same transitions of the new "
+        "circuit, the same replay and the same batches. The two panels at the upper left are the paper's figure. "
+        "Sample size and the gradient's variance do not change when all weights are scaled by one constant. Lines: "
+        "median over adaptations, with quartiles."
+    )
+    document.figure("figure-2", figures.draw_figure_2(updates, gradients))
+    found: dict[str, Any] = {}
+    rows = []
+    ratios = (
+        ("variance of the weighted critic loss", updates, "critic_loss_variance", PAPER_RATIO),
+        ("effective sample size", updates, "effective_sample_size", None),
+        ("unweighted TD error", updates, "td_error", None),
+        ("gradient variance, β of mean 1", gradients, "gradient_variance", None),
+    )
+    for label, source, column, paper in ratios:
+        for reference in ("none", "fixed"):
+            ratio = ratio_over_adaptations(source, "abc", reference, column)
+            published = 1.0 / paper if paper is not None and reference == "none" else None
+            found[f"{column}_abc_over_{reference}"] = {**ratio, "seeds": len(plan.clipping), "published": published}
+            rows.append(
+                [
+                    label,
+                    figures.RULES[reference],
+                    f"{ratio['value']:.3g} [{ratio['low']:.3g}, {ratio['high']:.3g}]",
+                    f"{published:.2g}" if published else "",
+                    _ratio_claim(ratio),
+                ]
+            )
+    document.text(
+        "ABC over another rule: geometric mean of the ratio over adaptations [95 %]. Below 1: ABC's is the smaller. "
+        "Adaptations that start from one training are not independent: the intervals are for these trainings."
+    )
+    document.table(["number", "ABC over", "ratio", "the paper", "shown"], rows)
+    return found
+
+
+def _ratio_claim(ratio: Mapping[str, float]) -> str:
+    if ratio["high"] < 1.0:
+        return "**smaller**"
+    return "**larger**" if ratio["low"] > 1.0 else "not shown"
+
+
+def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
+    document.text("## Appendix")
+    if plan.opponents:
+        curves = {
+            f"{unit.max_speed_mps:g} m/s": [figures.read_learning(_opponent_run(unit, work))] for unit in plan.opponents
+        }
+        document.text("### A: opponents of every top speed learn", _verification(plan, work))
+        document.figure("appendix-a", figures.draw_learning(curves, "Appendix A: PPO for every top speed"))
+    else:
+        document.text(
+            "### A: opponents of every top speed learn",
+            "Not in this budget: the opponents are those that come with outlap.",
+        )
+    for letter, key in zip("BCEF", APPENDIX_TITLES, strict=True):
+        units = plan.curves.get(key, ())
+        if not units:
+            continue
+        curves = {APPENDIX_TITLES[key]: [figures.read_learning(unit.folder(work)) for unit in units]}
+        document.text(f"### {letter}: {APPENDIX_TITLES[key].partition(': ')[2]}")
+        document.figure(f"appendix-{letter.lower()}", figures.draw_learning(curves, APPENDIX_TITLES[key]))
+        if letter == "C":
+            document.text("### D: β and ABC's β during adaptation")
+            histograms, updates = _read_clipping(plan, work, "histograms"), _read_clipping(plan, work, "updates")
+            document.figure("appendix-d", figures.draw_weights(histograms, updates))
+
+
+def _opponent_run(unit: OpponentUnit, work: Path) -> Path:
+    return unit.folder(work) / "runs" / unit.name
+
+
+def _verification(plan: Plan, work: Path) -> str:
+    """Which opponents completed their laps."""
+    failed = []
+    for unit in plan.opponents:
+        laps = pd.read_parquet(unit.folder(work) / ROWS)["completed_laps"].to_numpy()
+        if (laps < unit.laps).any():
+            failed.append(unit.name)
+    first = plan.opponents[0]
+    passed = f"{len(plan.opponents) - len(failed)} of {len(plan.opponents)} completed {first.laps} laps"
+    left_out = f"; left out of all races: {', '.join(failed)}" if failed else ""
+    return f"{passed} from each of {first.starts} standing starts{left_out}."
+
+
+def _core_seconds(plan: Plan, work: Path) -> dict[str, float]:
+    """What the units took, by kind."""
+    seconds: dict[str, float] = {}
+    for unit in plan.units:
+        seconds[unit.kind] = seconds.get(unit.kind, 0.0) + float(done_record(unit, work)["seconds"])
+    return seconds
+
+
+def _write_record(document: Document, plan: Plan, record: Mapping[str, Any]) -> None:
+    """Command, machine, versions, and everything that was configured."""
+    machine, versions = record["machine"], record["versions"]
+    document.text("## How this was made")
+    document.text(f"```sh\n{record['command']}\n```")
+    document.text(
+        f"{machine['processor']}, {machine['cores']} cores, {machine['system']}; "
+        + ", ".join(f"{name} {version}" for name, version in versions.items())
+        + "."
+    )
+    document.table(
+        ["work", "units", "core minutes"],
+        [
+            [kind, str(sum(unit.kind == kind for unit in plan.units)), f"{seconds / 60.0:.0f}"]
+            for kind, seconds in record["core_seconds"].items()
+        ],
+    )
+    settings = {"budget": plan.budget.model_dump(mode="json", exclude_defaults=True)}
+    settings["methods"] = {
+        name: method.model_dump(mode="json", exclude_defaults=True) for name, method in plan.methods.items()
+    }
+    document.text("### Configuration")
+    document.text(f"```yaml\n{yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)}```")
+    document.text(
+        f"Every episode is a row of `{ROWS}`; all numbers are in `results.json`, task sets included. The run folder of "
+        "each training is under `work/trainings`."
+    )

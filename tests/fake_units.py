@@ -1,0 +1,48 @@
+"""Units of work for tests of the runner; in a module of their own, since workers import them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from outlap.experiments.units import Report, Unit
+
+
+@dataclass(frozen=True, eq=False)
+class Fake(Unit):
+    """Writes when it began and ended, and how often; may fail, and may take long."""
+
+    kind = "fakes"
+    before: tuple[Fake, ...] = ()
+    fails: bool = False
+    ticks: int = 1  # of 50 ms
+
+    @property
+    def seconds(self) -> float:
+        return 0.05 * self.ticks
+
+    def do(self, work: Path, report: Report) -> None:
+        folder = self.folder(work)
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "begun").open("a") as file:
+            file.write(f"{time.monotonic()}\n")
+        if self.fails:
+            raise ValueError("no luck")
+        path = folder / "ticks"
+        for tick in range(int(path.read_text()) if path.exists() else 0, self.ticks):
+            time.sleep(0.05)
+            path.write_text(str(tick + 1))
+            report((tick + 1) / self.ticks)
+        (folder / "ended").write_text(str(time.monotonic()))
+
+
+def begun(unit: Fake, work: Path) -> list[float]:
+    """When the unit was begun, once for every time."""
+    path = unit.folder(work) / "begun"
+    return [float(line) for line in path.read_text().split()] if path.exists() else []
+
+
+def ended(unit: Fake, work: Path) -> float:
+    """When it was through."""
+    return float((unit.folder(work) / "ended").read_text())
