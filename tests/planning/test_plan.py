@@ -268,7 +268,7 @@ def test_real_circuits_are_lapped_no_slower_than_their_own_racelines(real_tracks
 
 
 def test_pure_pursuit_drives_the_planned_lap_of_a_real_circuit(real_tracks: FilePath):
-    track = Track.load(real_tracks / "Silverstone")
+    track = Track.load(real_tracks / "IMS")
     task = RaceConfig(vehicle=VehicleParams(v_max=8.0), racing_line="min-time", beams=0)
     rows = evaluate(PurePursuit(), standing_starts(task, [track], laps=1), [track], episodes=4, seed=0)
     assert rows["outcome"].tolist() == ["finished"] * 4

@@ -74,5 +74,5 @@ def test_a_run_of_another_algorithm_is_named() -> None:
     stopped_after(256, SMALL, Path("run"))
     path = Path("run/config.yaml")
     path.write_text(path.read_text().replace("algorithm: mql", "algorithm: dqn"))
-    with pytest.raises(OutlapError, match=r"algorithm is 'dqn'; must be one of ppo, mql"):
+    with pytest.raises(OutlapError, match=r"algorithm is 'dqn'; must be one of ppo, recurrent-ppo, mql"):
         load_run("run")

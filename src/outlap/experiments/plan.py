@@ -41,7 +41,6 @@ class TablePlan:
 
     name: str
     task_set: str
-    circuits: Circuits
     races: tuple[RaceUnit, ...]
 
 
@@ -53,6 +52,7 @@ class Plan:
     budget: Budget
     methods: dict[str, Method]
     task_sets: dict[str, TaskSet]
+    circuits: dict[str, Circuits]  # that are used, by task set
     tables: tuple[TablePlan, ...]
     clipping: tuple[ClippingUnit, ...]  # of figure 2 and the appendix's histograms
     curves: dict[tuple[str, str], tuple[TrainingUnit, ...]]  # of the appendix, by task set and method
@@ -146,6 +146,7 @@ class _Planner:
             self.budget,
             self.methods,
             self.task_sets,
+            {name: self._circuits(name) for name in self.task_sets},
             tuple(sorted(tables, key=lambda table: (not self._published(table), table.name))),
             self._clipping() if appendix or FIGURE_2 in wanted else (),
             curves,
@@ -197,7 +198,7 @@ class _Planner:
                         population=self._population_of(task_set),
                     )
                 )
-        return TablePlan(name, task_set, circuits, tuple(races))
+        return TablePlan(name, task_set, tuple(races))
 
     def _env(self, task_set: str) -> RaceConfig:
         """The task set's cars and sensors, as every method is tested with them."""

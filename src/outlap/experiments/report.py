@@ -13,7 +13,7 @@ import yaml
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments import figures
 from outlap.experiments.document import Document
-from outlap.experiments.plan import Plan
+from outlap.experiments.plan import CLIPPING_TASKS, Plan
 from outlap.experiments.results import (
     METRICS,
     Cell,
@@ -75,7 +75,7 @@ def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
         "budget": plan.budget,
         "methods": plan.methods,
         "task_sets": plan.task_sets,
-        "circuits": {table.name: table.circuits for table in plan.tables},
+        "circuits": plan.circuits,
     }
     _write_record(document, plan, record)
     data["record"] = record
@@ -102,8 +102,7 @@ def _introduction(plan: Plan, work: Path) -> str:
 def _write_table(document: Document, plan: Plan, result: TableResult, titles: Mapping[str, str]) -> None:
     table = result.plan
     race = table.races[0]
-    circuits = table.circuits
-    document.text(f"## {result.title}; {circuits.title}")
+    document.text(f"## {result.title}; {plan.circuits[table.task_set].title}")
     names = ", ".join(dict.fromkeys(task.track for task in race.tasks))
     document.text(
         f"{len(race.tasks)} tasks on {names}; {race.episodes} races of {race.time_limit:g} s on each, for every method "
@@ -183,7 +182,7 @@ def _read_clipping(plan: Plan, work: Path, name: str) -> pd.DataFrame:
 
 def _write_clipping(document: Document, plan: Plan, work: Path) -> dict[str, Any]:
     updates, gradients = _read_clipping(plan, work, "updates"), _read_clipping(plan, work, "gradients")
-    document.text("## Figure 2: what clipping does to adaptation")
+    document.text(f"## Figure 2: what clipping does to adaptation; {plan.circuits[CLIPPING_TASKS].title}")
     document.text(
         f"{len(plan.clipping)} adaptations to unseen circuits; for every clip rule the same transitions of the new "
         "circuit, the same replay and the same batches. The two panels at the upper left are the paper's figure. "
@@ -245,7 +244,7 @@ def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
         if not units:
             continue
         curves = {APPENDIX_TITLES[key]: [figures.read_learning(unit.folder(work)) for unit in units]}
-        document.text(f"### {letter}: {APPENDIX_TITLES[key].partition(': ')[2]}")
+        document.text(f"### {letter}: {APPENDIX_TITLES[key].partition(': ')[2]}; {plan.circuits[key[0]].title}")
         document.figure(f"appendix-{letter.lower()}", figures.draw_learning(curves, APPENDIX_TITLES[key]))
         if letter == "C":
             document.text("### D: β and ABC's β during adaptation")
