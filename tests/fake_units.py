@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ class Fake(Unit):
     kind = "fakes"
     before: tuple[Fake, ...] = ()
     fails: bool = False
+    dies: bool = False  # takes its process with it
     ticks: int = 1  # of 50 ms
 
     @property
@@ -27,6 +29,8 @@ class Fake(Unit):
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "begun").open("a") as file:
             file.write(f"{time.monotonic()}\n")
+        if self.dies:
+            os._exit(9)
         if self.fails:
             raise ValueError("no luck")
         path = folder / "ticks"

@@ -41,8 +41,10 @@ def test_everything_comes_from_one_command(made: Path):
                 assert entry["seeds"] == 1
     assert data["tables"]["table-1"]["mql"]["crashes"]["published"] == 500
     assert data["tables"]["table-3"]["recurrent-ppo"]["crashes"]["published"] is None
-    variance = data["figure-2"]["critic_loss_variance_abc_over_none"]
-    assert variance["published"] == pytest.approx(8.40e-7 / 2.23e-6)
+    variance = data["figure-2"]["loss_variance"]
+    assert (variance["fixed"]["published"], variance["abc"]["published"]) == (2.23e-6, 8.40e-7)
+    assert variance["abc_over_fixed"]["published"] == pytest.approx(1 / 2.7, abs=0.01)
+    assert (variance["abc_over_fixed"]["seeds"], variance["abc_over_fixed"]["adaptations"]) == (1, 2)
     assert data["record"]["versions"]["outlap"]
     assert data["record"]["command"]
 
@@ -68,6 +70,7 @@ def test_the_report_is_whole_and_stands_by_itself(made: Path):
     assert page.count("<table>") == len(re.findall(r"^\|---\|", markdown, re.MULTILINE))
     assert "built-in" in next(line for line in markdown.splitlines() if line.startswith("## Table III"))
     assert "too small to say anything" in markdown
+    assert "| MQL-ABC | 1,280 |" in markdown  # what went into every method
 
 
 def test_the_same_command_again_does_no_work_and_part_of_it_neither(made: Path, capfd: pytest.CaptureFixture[str]):

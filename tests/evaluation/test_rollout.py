@@ -332,3 +332,36 @@ def test_no_yardstick_is_asked_for_or_can_be_planned(caplog, monkeypatch):
     assert rows["completed_laps"].to_numpy().max() > 0
     assert np.isnan(rows["lap_time_ratio"].to_numpy()).all()
     assert "no lap_time_ratio: track ring5: at s = " in caplog.text
+
+
+class Listener:
+    """Drives like the follower, and keeps what it hears of rewards."""
+
+    name, scale_observations = "listener", False
+
+    def __init__(self, reward: RewardConfig | None) -> None:
+        self.follower, self.reward = follower(), reward
+        self.observation_terms = (*self.follower.observation_terms, "previous_reward")
+        self.heard: list[float] = []
+
+    def begin(self, cars: np.ndarray) -> None:
+        self.follower.begin(cars)
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        self.heard.append(float(observation["previous_reward"][0, 0]))
+        return self.follower.act(observation)
+
+
+def test_a_driver_hears_the_rewards_of_its_training_and_is_told_of_in_the_tasks():
+    task = SLIPPERY.model_copy(update={"reward": RewardConfig(preset="paper", collision_max=1.0)})
+    task = standing_starts(task, [LARGE], laps=1)
+    fast, native = Listener(RewardConfig()), Listener(None)
+    rows, plain = (evaluate(each, task, [LARGE], 1, 5) for each in (fast, native))
+    # The same drive, scored alike to rounding, by a reward that only one of them heard.
+    assert rows["episode_steps"].tolist() == plain["episode_steps"].tolist()
+    for column in ("episode_return", "last_reward"):
+        np.testing.assert_allclose(rows[column].to_numpy(), plain[column].to_numpy(), rtol=1e-9)
+    own = evaluate(Listener(None), task.model_copy(update={"reward": RewardConfig()}), [LARGE], 1, 5)
+    assert sum(native.heard) == pytest.approx(plain["episode_return"][0] - plain["last_reward"][0], rel=1e-5)
+    assert sum(fast.heard) == pytest.approx(own["episode_return"][0] - own["last_reward"][0], rel=1e-5)
+    assert abs(sum(fast.heard) - sum(native.heard)) > 1.0

@@ -57,6 +57,8 @@ def test_all_rules_see_the_same_weights_and_batches(meta: MQL, new: HistoryBuffe
     same = histograms.loc[histograms["rule"] == "none"]
     assert same["before"].tolist() == same["after"].tolist()
     assert len(same) == len(BETA_EDGES) - 1
+    iterations = found["iterations"]
+    assert iterations.groupby("rule").size().to_dict() == dict.fromkeys(CLIP_RULES, SETTINGS.iterations)
     assert shares == sorted(shares)
     assert shares[-1] < 1.0
     assert all(torch.equal(a, b) for a, b in zip(before, meta.policy.parameters(), strict=True))

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from outlap.drivers.follow_the_gap import FollowTheGap
+from outlap.errors import OutlapError
 from outlap.evaluation.statistics import wilson_interval
 from outlap.experiments.comparison import Subject, compare, group
 from outlap.training.ppo import PPOConfig
@@ -26,6 +27,11 @@ def test_runs_that_differ_in_the_seed_alone_are_one_method():
     ]  # fmt: skip
     groups = {label: [each.name for each in members] for label, members in group(subjects).items()}
     assert groups == {"a (2 seeds)": ["a", "b"], "c": ["c"], "a": ["a"], "follow-the-gap": ["follow-the-gap"]}
+
+
+def test_the_same_training_twice_is_refused():
+    with pytest.raises(OutlapError, match="is there twice"):
+        group([subject("a", seed=3), subject("b", seed=4), subject("a", seed=3)])
 
 
 def test_methods_of_one_name_are_told_apart():
@@ -70,6 +76,9 @@ def test_several_runs_of_both_are_compared_by_seeds():
     assert by_seed
     assert cells["a"]["crashes"].mean == pytest.approx(110.0)
     assert differences[0].claim == "worse"
+    # Seeds are paired by their numbers, and not by their order.
+    backwards = rows.iloc[::-1].reset_index(drop=True)
+    assert compare(backwards, ["a", "b"], alone=True)[1][0] == differences[0]
     unequal = compare(rows.loc[~((rows["method"] == "b") & (rows["training_seed"] == 2))], ["a", "b"], alone=True)
     assert unequal[2]
     assert unequal[1][0].difference == pytest.approx(215.0 - 110.0)

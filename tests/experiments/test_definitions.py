@@ -43,7 +43,11 @@ def test_a_file_of_ones_own_is_named_by_its_path(tmp_path: Path):
         ("title: x\ndriver: follow-the-gap\ntraining: {algorithm: ppo}", "must have either a driver or a training"),
         ("title: x\ntraining: {gamma: 0.9}", "training must name an algorithm"),
         ("title: x\ntraining: {algorithm: ppo}\nadaptation: {clip: abc}", "adaptation is of algorithm mql alone"),
-        ("title: x\ntraining: {algorithm: mql}\nadaptation: {clip: half}", "one of none, fixed, abc"),
+        (
+            "title: x\ntraining: {algorithm: mql}\nadaptation: {iterations: 3}",
+            "must have a clip, one of none, fixed, abc",
+        ),
+        ("title: x\ntraining: {algorithm: ppo, env: {beams: 54}}", "training may not change env.beams"),
         ("title: x\ntrainig: {algorithm: mql}", "did you mean training?"),
     ],
 )

@@ -11,8 +11,9 @@ import yaml
 from outlap.config import bounds
 from outlap.errors import OutlapError
 from outlap.experiments.definitions import FOLDERS, Budget
-from outlap.experiments.plan import Plan, artefacts, make_plan
-from outlap.experiments.units import ClippingUnit, OpponentUnit, RaceUnit, TrainingUnit
+from outlap.experiments.plan import Plan, artefacts, make_plan, remember_tracks
+from outlap.experiments.units import ClippingUnit, OpponentUnit, RaceUnit, TrainingUnit, adaptation_settings
+from outlap.mql.propensity import AdaptiveBetaClip
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -70,7 +71,8 @@ def test_every_method_is_raced_on_the_same_tasks_cars_and_rewards(whole: Plan):
         assert {race.method for race in table.races} == {*whole.methods}
         assert len({str((race.env, race.tasks, race.episodes, race.time_limit)) for race in table.races}) == 1
         race = table.races[0]
-        assert race.env.reward.preset == "paper"
+        assert (race.score.preset, race.score.collision_max) == ("paper", 1.0)
+        assert race.env.reward.preset == "fast"  # what a context is shown
         wanted = whole.budget.episodes * whole.task_sets[table.task_set].tables[table.name].share
         assert 0 <= race.episodes * len(race.tasks) - wanted < len(race.tasks)
 
@@ -98,8 +100,9 @@ def test_vehicles_are_tested_on_both_sides_of_the_range_of_training(whole: Plan)
     trained = race.training.config.env.vehicle
     for name in ("mu", "m", "I", "C_Sf", "C_Sr", "a_max"):
         low, high = bounds(getattr(trained, name))
-        below, above = (task.changes["vehicle"][name] for task in race.tasks)
-        assert below["max"] <= low < high <= above["min"]
+        cars = [task.changes["vehicle"][name] for task in race.tasks]  # a task is one car
+        assert cars == sorted(cars)
+        assert cars[1] < low < high < cars[2]
 
 
 def test_a_change_makes_anew_what_depends_on_it_and_nothing_else(tmp_path: Path):
@@ -175,6 +178,65 @@ def test_a_budget_with_an_unknown_field_is_found_before_any_work(tmp_path: Path)
         make_plan(["table-3"], budget_file(tmp_path, "c", adaptation__replay_step=3))
     with pytest.raises(OutlapError, match=r"training of .* total_step is not a known field; did you mean total_steps"):
         make_plan(["table-3"], budget_file(tmp_path, "d", training__ppo__total_step=3))
+
+
+def test_all_methods_of_a_budget_are_trained_for_the_same_penalties(whole: Plan):
+    for unit in whole.units:
+        if isinstance(unit, TrainingUnit):
+            reward = unit.config.env.reward
+            assert reward.collision_steps == pytest.approx(6 * unit.config.total_steps)
+    for unit in make_plan(["all"], "paper", seeds=1).units:
+        if isinstance(unit, TrainingUnit):
+            assert (unit.config.env.reward.preset, unit.config.env.reward.collision_max) == ("paper", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("training: {algorithm: mql}\nadaptation: {clip: half}", "adaptation: clip is 'half'; must be"),
+        (
+            "training: {algorithm: mql}\nadaptation: {clip: {rule: abc, kk: 2}}",
+            "adaptation: clip abc: kk is not a known",
+        ),
+        ("training: {algorithm: mql}\nadaptation: {clip: abc, iterations: 2.5}", "iterations is 2.5; must be a whole"),
+        ("training: {algorithm: a2c}", "algorithm is 'a2c'; must be one of ppo"),
+        ("driver: nobody", "driver is 'nobody'; must be"),
+        ("driver: follow-the-gap\nagainst: [nobody]", "is to be compared with 'nobody'"),
+    ],
+)
+def test_a_wrong_method_is_found_before_any_work(content: str, said: str, tmp_path: Path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"title: Mine\n{content}\n")
+    with pytest.raises(OutlapError) as error:
+        make_plan(["table-3"], "cpu", [str(path)], 1)
+    assert said in str(error.value)
+
+
+def test_a_clip_rule_takes_constants_of_its_own():
+    settings = adaptation_settings({"clip": {"rule": "abc", "k": 2}, "replay_steps": 7})
+    assert (settings.clip, settings.replay_steps) == (AdaptiveBetaClip(k=2), 7)
+
+
+def test_names_are_not_taken_twice(tmp_path: Path):
+    (tmp_path / "mql.yaml").write_text("title: Mine\ntraining: {algorithm: mql}\n")
+    with pytest.raises(OutlapError, match="another one is called mql; rename the file"):
+        make_plan(["table-3"], "cpu", [str(tmp_path / "mql.yaml")])
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "title: x\ncircuits: [{title: x, train: [Foxglove]}]\ntables: {vehicles: {title: x, circuits: train}}\n"
+    )
+    with pytest.raises(OutlapError, match="is called vehicles already"):
+        make_plan([str(path)], "cpu")
+
+
+def test_a_track_that_changes_under_its_name_is_noticed(tmp_path: Path):
+    plan = make_plan(["table-1"], "smoke", ["follow-the-gap"], 1)
+    assert plan.tracks == ["Emberley"]
+    remember_tracks(plan, tmp_path)
+    remember_tracks(plan, tmp_path)
+    (tmp_path / "tracks.json").write_text('{"Emberley": "another"}')
+    with pytest.raises(OutlapError, match="was made with another track called Emberley"):
+        remember_tracks(plan, tmp_path)
 
 
 def test_the_papers_tables_and_figures_can_be_named():

@@ -98,12 +98,14 @@ def test_one_seed_shows_nothing():
 def test_a_ratio_over_adaptations_is_paired_and_geometric():
     updates = pd.DataFrame(
         {
+            "seed": np.repeat([0, 1, 0], 6),  # two adaptations start from the first training
             "adaptation_seed": np.repeat([0, 1, 2], 6),
             "rule": ["abc", "none"] * 9,
-            "x": [1.0, 2.0] * 3 + [10.0, 80.0] * 3 + [3.0, 12.0] * 3,  # ratios 1/2, 1/8, 1/4
+            "x": [1.0, 2.0] * 3 + [10.0, 80.0] * 3 + [1.0, 32.0] * 3,  # ratios 1/2, 1/8, 1/32
         }
     )
     ratio = ratio_over_adaptations(updates, "abc", "none", "x")
-    assert ratio["value"] == pytest.approx(0.25)
-    logs = estimate_mean(np.log([0.5, 0.125, 0.25]))
+    logs = estimate_mean(np.log([0.125, 0.125]))  # the first training's is between its two
+    assert ratio["value"] == pytest.approx(0.125)
     assert (ratio["low"], ratio["high"]) == pytest.approx((np.exp(logs.low), np.exp(logs.high)))
+    assert (ratio["seeds"], ratio["adaptations"]) == (2, 3)

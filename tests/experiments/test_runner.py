@@ -50,6 +50,16 @@ def test_what_fails_stops_only_those_that_need_it(tmp_path: Path):
     assert [len(begun(unit, tmp_path)) for unit in (broken, other)] == [2, 1]
 
 
+def test_a_process_that_dies_takes_no_other_unit_with_it(tmp_path: Path):
+    deadly = Fake("deadly", dies=True)
+    others = [Fake("other", ticks=6), Fake("next"), Fake("last")]
+    with pytest.raises(OutlapError, match="1 of 4 units of work failed, deadly first") as error:
+        run_units([deadly, *others], tmp_path, jobs=2)
+    assert "BrokenProcessPool" in str(error.value)
+    assert all(unit.is_done(tmp_path) for unit in others)
+    assert len(begun(deadly, tmp_path)) == 2  # beside another one, and alone
+
+
 SCRIPT = """
 from pathlib import Path
 from fake_units import Fake

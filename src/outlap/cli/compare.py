@@ -32,7 +32,8 @@ class Compare:
     """Run folders of `outlap train`, or drivers without one, such as follow-the-gap."""
 
     task: str | None = None
-    """A run folder in whose task all are raced: cars with their ranges, opponents, tracks; by default the first."""
+    """A run folder in whose task all are raced: cars with their ranges, opponents, tracks; by default the first run. Of
+    a driver that has a scanner and a top speed of its own, those stay."""
 
     tracks: tuple[str, ...] = ()
     """Names or map folders; by default the task's held-out tracks, or else the built-in held-out ones."""
@@ -60,7 +61,7 @@ class Compare:
 
         from outlap.envs.tasks import load_tracks
         from outlap.evaluation.results import prepare_folder
-        from outlap.evaluation.rollout import evaluate, standing_starts
+        from outlap.evaluation.rollout import evaluate, made_for, standing_starts
         from outlap.experiments.comparison import Subject, group, write_comparison
         from outlap.training.run import provenance
 
@@ -72,9 +73,9 @@ class Compare:
             raise OutlapError("one run alone; name two or more, or use outlap evaluate")
         found = [(name, *find_subject(name)) for name in self.runs]
         subjects = [Subject(driver.name if run else name, driver, run) for name, driver, _, run in found]
-        _, _, env, run = (None, *find_subject(self.task)) if self.task else found[0]
+        _, task, run = find_subject(self.task) if self.task else found[0][1:]
         tracks = load_tracks(self.tracks or held_out_tracks(run))
-        races = standing_starts(env.model_copy(update={"opponent_split": "held_out"}), tracks, 0, self.time_limit)
+        races = standing_starts(task.model_copy(update={"opponent_split": "held_out"}), tracks, 0, self.time_limit)
         folder = self.out or unused(Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S"))
         prepare_folder(folder)
         groups = group(subjects)
@@ -82,13 +83,14 @@ class Compare:
         total = len(subjects) * len(tracks) * self.episodes
         with progress_bar("racing", total, "episodes", self.quiet) as update:
             for method, members in groups.items():
-                for number, subject in enumerate(members):
+                for subject in members:
                     before = len(rows) * len(tracks) * self.episodes
+                    env = made_for(subject.driver, races)
                     raced = evaluate(
-                        subject.driver, races, tracks, self.episodes, self.seed, lap_time_ratios=False,
+                        subject.driver, env, tracks, self.episodes, self.seed, lap_time_ratios=False,
                         on_progress=lambda now, before=before, name=subject.name: update(before + int(now.done), name),
                     )  # fmt: skip
-                    rows.append(raced.assign(method=method, training_seed=number, task=raced["track"]))
+                    rows.append(raced.assign(method=method, training_seed=subject.seed, task=raced["track"]))
         record = {**provenance(), "settings": self, "env": races}
         everything = pd.concat(rows, ignore_index=True)
         data = write_comparison(folder, everything, groups, races.num_cars == 1, record)

@@ -61,7 +61,7 @@ class Reproduce:
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
-        from outlap.experiments.plan import make_plan
+        from outlap.experiments.plan import make_plan, remember_tracks
         from outlap.experiments.report import write_report
         from outlap.experiments.runner import Status, run_units
 
@@ -74,6 +74,7 @@ class Reproduce:
         missing = [unit for unit in units if not unit.is_done(work)]
         if self.dry_run:
             return _dry(units, missing, self.jobs)
+        remember_tracks(plan, work)
         with progress_bar("reproducing", 1000, "‰", self.quiet) as update:
 
             def show(status: Status) -> None:
@@ -131,7 +132,8 @@ def _print(console: Console, data: Mapping[str, Any], folder: Path) -> None:
 
     for name, methods in data["tables"].items():
         metrics = [metric for metric in SHOWN if metric in next(iter(methods.values()))]
-        table = Table(box=box.SIMPLE_HEAD, title=name, title_justify="left")
+        title = f"{name}; {data['record']['circuits'][name].title}"
+        table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
         table.add_column("method")
         for metric in metrics:
             table.add_column(Text(SHOWN[metric]), justify="right")

@@ -35,6 +35,7 @@ class PolicyDriver:
         seed: int = 0,
         name: str = "policy",
         speeds: tuple[float, float] | None = None,
+        reward: Any = None,
     ) -> None:
         """Wrap a model.
 
@@ -46,6 +47,7 @@ class PolicyDriver:
             name: in results.
             speeds: [m/s] that its actions -1 and 1 commanded in training, for a car whose speeds are others; None:
                 those of the car.
+            reward: the RewardConfig that it was trained with, for one that observes rewards; None: the task's.
 
         Raises OutlapError for a model whose observations or actions are not those of outlap.
         """
@@ -58,6 +60,7 @@ class PolicyDriver:
         self.observation_terms = tuple(space.spaces)
         self.scale_observations = scale_observations
         self.speeds = speeds
+        self.reward = reward
         self.beams = _size(space["scan"]) if "scan" in space.spaces else None
         self._space = space
         self._policy: Any = getattr(model, "policy", model)
@@ -82,6 +85,7 @@ class PolicyDriver:
         seed: int = 0,
         name: str = "policy",
         speeds: tuple[float, float] | None = None,
+        reward: Any = None,
     ) -> PolicyDriver:
         """A model of an algorithm, PPO's by default, from the file that Stable-Baselines3 wrote, on the CPU.
 
@@ -105,6 +109,7 @@ class PolicyDriver:
             seed=seed,
             name=name,
             speeds=speeds,
+            reward=reward,
         )
 
     def check(self, space: gym.Space) -> None:

@@ -20,9 +20,10 @@ from gymnasium.vector import AutoresetMode
 from outlap.drivers.driver import Driver, ask
 from outlap.drivers.find import find_drivers
 from outlap.drivers.policy import PolicyDriver
-from outlap.envs.race import EGO
+from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.rewards import REWARD_TERMS, RewardConfig
 from outlap.envs.tasks import load_tracks
 from outlap.envs.terminations import CRASH, TerminationConfig
 from outlap.errors import OutlapError
@@ -108,8 +109,9 @@ def evaluate(
 ) -> pd.DataFrame:
     """Race `driver` in `episodes` episodes on each track.
 
-    Nothing is learnt, and reward curricula are taken at their end. An episode can be raced again with
-    `RaceEnv(tracks=[track], ...).reset(seed=...)` and its row's seed.
+    Nothing is learnt, and reward curricula are taken at their end. Returns are of the task's reward; a driver that
+    observes rewards is shown those that it was trained with, whatever the task's are. An episode can be raced again
+    with `RaceEnv(tracks=[track], ...).reset(seed=...)` and its row's seed.
 
     Args:
         driver: of the first car.
@@ -180,7 +182,9 @@ def _race(
 ) -> tuple[list[dict[str, Any]], int]:
     """Every episode of one track: its rows, and the steps that they took."""
     worlds = min(num_worlds, len(seeds))
-    env = RaceVectorEnv(worlds, **episode_settings(driver, config, track), autoreset_mode=AutoresetMode.DISABLED)
+    settings = episode_settings(driver, config, track)
+    env = RaceVectorEnv(worlds, **settings, autoreset_mode=AutoresetMode.DISABLED)
+    score = _Score(config.reward, settings["reward"], worlds)
     if isinstance(driver, PolicyDriver):
         driver.check(env.single_observation_space)
     drawn = drawn_parameters(config)
@@ -198,6 +202,7 @@ def _race(
         observation, rewards, terminated, truncated, info = env.step(ask(driver, observation, worlds))
         steps += int((racing != IDLE).sum())
         over = terminated | truncated
+        last, returns = score.step(env.race, rewards, info)
         for world in np.flatnonzero(over & (racing != IDLE)).tolist():
             episode = int(racing[world])
             rows[episode] = {
@@ -208,7 +213,8 @@ def _race(
                 **_row(info, world),
                 "terminated": bool(terminated[world]),
                 "truncated": bool(truncated[world]),
-                "last_reward": float(rewards[world]),
+                "episode_return": float(returns[world]),
+                "last_reward": float(last[world]),
                 "start_m": float(start[world] % length),
                 **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
                 **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in range(1, config.num_cars)},
@@ -224,6 +230,7 @@ def _race(
                     upcoming += 1
             observation, info = env.reset(seed=again, options={"reset_mask": over})
             driver.begin(over)
+            score.begin(over)
             start[over] = env.race.start[over, EGO]
         watch(len(rows), len(rows) + _underway(config, length, start, info, racing != IDLE), steps)
     return [rows[episode] for episode in range(len(seeds))], steps
@@ -257,8 +264,8 @@ def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[s
     settings["observation"] = driver.observation_terms
     settings["scale_observations"] = driver.scale_observations
     # At the end of every curriculum nothing is left of it: no lines need to be planned for a reference speed.
-    weights = {**config.reward.weights, "velocity_matching": 0.0}
-    settings["reward"] = config.reward.model_copy(update={"weights": weights})
+    shown = getattr(driver, "reward", None) or config.reward
+    settings["reward"] = _without_reference(shown)
     others: list[Driver] = []
     if config.num_cars > 1:
         others = find_drivers(config.opponents, config.field_of_view, config.opponent_split, config.opponent_code)
@@ -268,6 +275,33 @@ def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[s
     return settings
 
 
+def _without_reference(reward: RewardConfig) -> RewardConfig:
+    return reward.model_copy(update={"weights": {**reward.weights, "velocity_matching": 0.0}})
+
+
+class _Score:
+    """Rewards of a task in races that show the driver another reward."""
+
+    def __init__(self, wanted: RewardConfig, shown: RewardConfig, worlds: int) -> None:
+        self.config = _without_reference(wanted)
+        self.weights = None if self.config == shown else self.config.resolved()
+        self.returns = np.zeros(worlds)
+
+    def step(self, race: Race, rewards: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """The reward of the last step and the return so far: (worlds,) each."""
+        if self.weights is None:
+            return rewards, info["episode_return"]
+        last = np.zeros(len(self.returns))
+        for name, weight in self.weights.items():
+            last += weight * REWARD_TERMS[name](race, EGO, self.config)
+        self.returns += last
+        return last, self.returns
+
+    def begin(self, worlds: np.ndarray) -> None:
+        """Episodes begin in some worlds, bool (worlds,)."""
+        self.returns[worlds] = 0.0
+
+
 def _row(info: dict[str, Any], world: int) -> dict[str, Any]:
     """What the environment says of an episode that just ended."""
     crashed = info["outcome"][world] == CRASH
@@ -275,7 +309,6 @@ def _row(info: dict[str, Any], world: int) -> dict[str, Any]:
         "outcome": str(info["outcome"][world]),
         "episode_steps": int(info["episode_steps"][world]),
         "duration_s": float(info["time_s"][world]),
-        "episode_return": float(info["episode_return"][world]),
         "overtakes": int(info["overtakes"][world]),
         "places_lost": int(info["places_lost"][world]),
         "completed_laps": int(info["completed_laps"][world]),

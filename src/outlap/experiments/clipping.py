@@ -39,10 +39,11 @@ def compare_rules(
         report: called with the share that is done.
 
     Returns:
-        `updates`: a row a replay update and rule, see `AdaptationRecord`. `histograms`: counts of β over all of them
-        before and after the clipping, by BETA_EDGES. `gradients`: of `gradient_variance`.
+        `updates`: a row a replay update and rule, and `iterations`: a row an iteration and rule, see
+        `AdaptationRecord`. `histograms`: counts of β over all updates before and after the clipping, by BETA_EDGES.
+        `gradients`: of `gradient_variance`.
     """
-    updates, histograms = [], []
+    updates, iterations, histograms = [], [], []
     for number, (name, rule) in enumerate(CLIP_RULES.items()):
         counts = np.zeros((2, len(BETA_EDGES) - 1), np.int64)
 
@@ -56,6 +57,7 @@ def compare_rules(
         _, record = adapt(
             meta, new, replace(settings, clip=rule()), seed=seed, on_iteration=show, on_weights=count
         )  # fmt: skip
+        iterations.append(pd.DataFrame(record.iterations).assign(rule=name))
         updates.append(pd.DataFrame(record.updates).assign(rule=name, update=np.arange(len(record.updates))))
         histograms.append(
             pd.DataFrame({"rule": name, "log10_beta": BETA_EDGES[:-1], "before": counts[0], "after": counts[1]})
@@ -63,6 +65,7 @@ def compare_rules(
     gradients = gradient_variance(meta, new, settings, seed, gradient_batches)
     return {
         "updates": pd.concat(updates, ignore_index=True),
+        "iterations": pd.concat(iterations, ignore_index=True),
         "histograms": pd.concat(histograms, ignore_index=True),
         "gradients": gradients,
     }

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from outlap.drivers.driver import Driver
+from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.evaluation.statistics import Estimate, estimate_mean, paired_difference, wilson_interval
 from outlap.experiments.document import Document
@@ -28,11 +29,16 @@ SKIPPED = ("episode_length", "reward")  # of the paper's short races
 
 @dataclass(frozen=True)
 class Subject:
-    """A driver with the seed of its training."""
+    """A driver, with its run if it was trained."""
 
     name: str
     driver: Driver
     run: Run | None
+
+    @property
+    def seed(self) -> int:
+        """Of its training."""
+        return self.run.config.seed if self.run else 0
 
     @property
     def method(self) -> str:
@@ -57,10 +63,18 @@ class Difference:
 
 
 def group(subjects: Sequence[Subject]) -> dict[str, list[Subject]]:
-    """Subjects by method; a method is called by its first run, and by how many there are."""
+    """Subjects by method; a method is called by its first run, and by how many there are.
+
+    Raises OutlapError for two of one method and seed.
+    """
     found: dict[str, list[Subject]] = {}
     for subject in subjects:
-        found.setdefault(subject.method, []).append(subject)
+        members = found.setdefault(subject.method, [])
+        if any(subject.seed == other.seed for other in members):
+            raise OutlapError(
+                f"{subject.name}: is there twice, or another run has its configuration and seed; leave one out"
+            )
+        members.append(subject)
     labels = [each[0].name + (f" ({len(each)} seeds)" if len(each) > 1 else "") for each in found.values()]
     return {
         label if labels.count(label) == 1 else f"{label} #{number + 1}": each
@@ -72,7 +86,7 @@ def compare(rows: pd.DataFrame, methods: Sequence[str], alone: bool) -> tuple[di
     """The numbers of every method, and its differences from the first one.
 
     Args:
-        rows: with `method`, `training_seed` (a number for each run of a method), `task` and `seed`.
+        rows: with `method`, `training_seed`, `task` and `seed`.
         methods: their names, the first one being what the others are compared with.
         alone: without other cars.
 
@@ -81,8 +95,8 @@ def compare(rows: pd.DataFrame, methods: Sequence[str], alone: bool) -> tuple[di
     """
     metrics = [name for name in METRICS if name not in SKIPPED and not (alone and name in RACING)]
     of_method = {method: rows.loc[rows["method"] == method] for method in methods}
-    counts = {method: len(np.unique(mine["training_seed"].to_numpy())) for method, mine in of_method.items()}
-    by_seed = min(counts.values()) > 1
+    seeds = {method: set(mine["training_seed"].tolist()) for method, mine in of_method.items()}
+    by_seed = min(map(len, seeds.values())) > 1
     cells: dict[str, Any] = {method: {} for method in methods}
     differences = []
     for metric in metrics:
@@ -91,10 +105,11 @@ def compare(rows: pd.DataFrame, methods: Sequence[str], alone: bool) -> tuple[di
             cells[method][metric] = estimate_mean(values[method].mean(axis=1))
         if metric == "crashes" and not by_seed:
             for method, mine in of_method.items():
-                cells[method][metric] = _of_crashes(mine, cells[method][metric])
+                if len(seeds[method]) == 1:  # races of several runs on the same episodes are not independent
+                    cells[method][metric] = _of_crashes(mine, cells[method][metric])
         first = methods[0]
         for method in methods[1:] if METRICS[metric].better else ():
-            paired = not by_seed or counts[method] == counts[first]
+            paired = not by_seed or seeds[method] == seeds[first]
             estimate = _difference(values[method], values[first], paired)
             better = METRICS[metric].better
             claim = claim_of(better * estimate.low, better * estimate.high)
@@ -120,7 +135,7 @@ def _of_crashes(rows: pd.DataFrame, estimate: Estimate) -> Estimate:
 def _difference(a: np.ndarray, b: np.ndarray, paired: bool) -> Estimate:
     if paired:
         return paired_difference(a, b)
-    # Welch's interval: other numbers of seeds cannot be paired.
+    # Welch's interval: other seeds cannot be paired.
     from scipy import stats
 
     left, right = a.mean(axis=1), b.mean(axis=1)

@@ -18,6 +18,8 @@ from outlap.mql.propensity import CLIP_RULES
 from outlap.track.catalog import list_tracks, name_key
 
 HERE = Path(__file__).parent
+# What of an environment belongs to a method; the rest is the task's, and the same for all.
+METHODS_OWN = ("observation", "scale_observations", "reward", "augment_tracks", "termination")
 
 
 class Method(Config):
@@ -26,7 +28,8 @@ class Method(Config):
     title: str
     driver: str | None = None  # that needs no training, see `drivers.find`
     training: dict[str, Any] = Field(default={})  # `algorithm`, and what differs from its defaults
-    adaptation: dict[str, Any] | None = None  # of MQL: `clip`, and what differs from the budget's
+    # Of MQL: `clip`, a rule's name or {rule: abc, k: 2.0}, and what differs from the budget's.
+    adaptation: dict[str, Any] | None = None
     against: tuple[str, ...] = ()  # methods that a report compares it with
 
     @model_validator(mode="after")
@@ -38,8 +41,12 @@ class Method(Config):
         if self.adaptation is not None:
             if self.training.get("algorithm") != "mql":
                 raise ValueError("adaptation is of algorithm mql alone; leave it out, or train with it")
-            if self.adaptation.get("clip") not in CLIP_RULES:
+            if "clip" not in self.adaptation:
                 raise ValueError(f"adaptation must have a clip, one of {', '.join(CLIP_RULES)}")
+        for name in self.training.get("env", {}):
+            if name not in METHODS_OWN:
+                own = ", ".join(METHODS_OWN)
+                raise ValueError(f"training may not change env.{name}, which is the task set's; it may change {own}")
         return self
 
 

@@ -21,6 +21,11 @@ class Document:
         self.folder = folder
         self.blocks: list[str] = []
 
+    def clear(self) -> None:
+        """Remove the figures of a report that was here before."""
+        for path in (self.folder / "figures").glob("*.*"):
+            path.unlink()
+
     def text(self, *blocks: str) -> None:
         """Add paragraphs or headings."""
         self.blocks += blocks

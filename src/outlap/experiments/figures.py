@@ -18,7 +18,6 @@ from outlap.viewer.plots import INK, WIDTH, new_figure
 
 # Okabe and Ito's palette, in an order that keeps neighbours apart.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-MARKERS = "osD^vP*X"
 RULES = {"none": "no clip", "fixed": "fixed clip", "abc": "ABC", "uniform": "β = 1"}
 RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uniform": COLOURS[7]}
 POINTS = 60  # of a learning curve
@@ -73,7 +72,7 @@ def draw_intervals(
     return figure
 
 
-def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str]) -> Figure:
+def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str], title: str) -> Figure:
     """The share of seeds and tasks that come further than a share of what top speed would give."""
     columns = min(3, len(results))
     rows = -(-len(results) // columns)
@@ -93,6 +92,7 @@ def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str]) -> 
     figure.legend(
         *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=7
     )
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
     _tidy(*grid.ravel())
     return figure
 
@@ -130,7 +130,7 @@ def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> F
     return figure
 
 
-def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame) -> Figure:
+def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame, title: str) -> Figure:
     """The paper's figure 2, and what remains of it once weights are made comparable.
 
     Args:
@@ -143,7 +143,7 @@ def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame) -> Figure:
         ("critic_loss", "weighted critic loss", True),
         ("critic_loss_variance", "its variance over the batch", True),
         ("effective_sample_size", "effective sample size", False),
-        ("td_error", "unweighted TD error", False),
+        ("td_error", "TD error of the replay, β = 1", False),
         ("clipped_share", "share of weights clipped", False),
     )
     for axes, (name, label, log) in zip(grid.ravel(), panels, strict=False):
@@ -177,11 +177,12 @@ def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame) -> Figure:
     figure.legend(
         *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
     )
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
     _tidy(*grid.ravel())
     return figure
 
 
-def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame) -> Figure:
+def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame, title: str) -> Figure:
     """β before and after ABC during adaptations: how they are distributed, and their largest over the updates."""
     figure = new_figure(WIDTH, 2.9)
     spread, largest = figure.subplots(1, 2)
@@ -207,6 +208,7 @@ def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame) -> Figure:
     largest.set(yscale="log")
     largest.set_xlabel("replay update (median over adaptations)", fontsize=8)
     largest.legend(fontsize=7, frameon=False)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
     _tidy(spread, largest)
     return figure
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from outlap.config import validate
+from outlap.drivers.find import find_drivers
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
@@ -22,7 +25,10 @@ from outlap.experiments.units import (
     Unit,
     adaptation_settings,
 )
-from outlap.files import to_json
+from outlap.files import atomic_write, to_json
+from outlap.track.catalog import find_entry
+from outlap.track.track import Track
+from outlap.training.ppo import PPOConfig
 
 FIGURE_2, APPENDIX, ALL = "figure-2", "appendix", "all"
 CLIPPING_TASKS = "tracks"  # the task set whose held-out circuits the clip rules are compared on
@@ -31,7 +37,7 @@ APPENDIX_TASK_SETS = ("opponents", "tracks")  # whose learning curves the append
 APPENDIX_METHODS = ("vanilla-dr", "mql-abc")  # of these methods
 TRAINING_SPEEDS = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0)  # [m/s] of the paper's opponents
 HELD_OUT_SPEEDS = (6.5, 7.0)
-# Races are told in the paper's reward, whatever a method was trained with; its authors left a crash's penalty at 1.
+# Its authors left a crash's penalty at 1.
 PAPER_REWARD = RewardConfig(preset="paper", collision_max=1.0)
 
 
@@ -57,6 +63,22 @@ class Plan:
     clipping: tuple[ClippingUnit, ...]  # of figure 2 and the appendix's histograms
     curves: dict[tuple[str, str], tuple[TrainingUnit, ...]]  # of the appendix, by task set and method
     opponents: tuple[OpponentUnit, ...]  # whose learning the appendix shows
+
+    @property
+    def tracks(self) -> list[str]:
+        """Names of all tracks that anything is done on."""
+        names: set[str] = set()
+        for unit in self.units:
+            match unit:
+                case TrainingUnit():
+                    names |= {*unit.config.env.tracks}
+                case RaceUnit():
+                    names |= {task.track for task in unit.tasks}
+                case ClippingUnit():
+                    names.add(unit.task.track)
+                case OpponentUnit():
+                    names.add(unit.track)
+        return sorted(names)
 
     @property
     def units(self) -> tuple[Unit, ...]:
@@ -99,6 +121,20 @@ def make_plan(
     return _Planner(budget_name, methods, seeds).plan(wanted)
 
 
+def remember_tracks(plan: Plan, work: Path) -> None:
+    """Note in a folder of work which tracks it is about: their names do not say.
+
+    Raises OutlapError for a track that is another one than when work was done there.
+    """
+    path = work / "tracks.json"
+    known: dict[str, str] = json.loads(path.read_text()) if path.exists() else {}
+    for name in plan.tracks:
+        fingerprint = Track.load(name).fingerprint
+        if known.setdefault(name, fingerprint) != fingerprint:
+            raise OutlapError(f"{work}: was made with another track called {name}; give another --out, or remove it")
+    atomic_write(path, to_json(known) + "\n")
+
+
 class _Planner:
     def __init__(self, budget_name: str, methods: Sequence[str], seeds: int | None) -> None:
         self.budget_name, budget = find(Budget, budget_name)
@@ -108,7 +144,19 @@ class _Planner:
         # Those that the paper has come first.
         tables = [table for task_set in self.task_sets.values() for table in task_set.tables.values()]
         published = [name for table in tables for name in table.published]
-        self.methods = dict(find(Method, name) for name in methods or dict.fromkeys([*published, *names_of(Method)]))
+        names = methods or list(dict.fromkeys([*published, *names_of(Method)]))
+        self.methods: dict[str, Method] = {}
+        for each in names:
+            name, method = find(Method, each)
+            if name in self.methods or (name != each and name in names_of(Method)):
+                raise OutlapError(f"method {each}: another one is called {name}; rename the file")
+            self.methods[name] = method
+        for name, method in self.methods.items():
+            if method.driver is not None:
+                find_drivers([method.driver], PPOConfig().env.field_of_view, split=None, run_code=True)
+            for other in method.against:
+                if other not in (*self.methods, *names_of(Method)):
+                    raise OutlapError(f"method {name}: is to be compared with {other!r}, and no method is called so")
 
     def plan(self, wanted: Sequence[str]) -> Plan:
         if not wanted:
@@ -116,6 +164,12 @@ class _Planner:
         files = [name for name in wanted if name.endswith((".yaml", ".yml"))]
         for file in files:
             name, task_set = find(TaskSet, file)
+            taken = [table for other in self.task_sets.values() for table in other.tables]
+            for known_name in (name, *task_set.tables):
+                if known_name in (*self.task_sets, *taken):
+                    raise OutlapError(
+                        f"{file}: a task set or table is called {known_name} already; give it another name"
+                    )
             self.task_sets[name] = task_set
         own = {table for file in files for table in find(TaskSet, file)[1].tables}
         known = [name for task_set in self.task_sets.values() for name in task_set.tables]
@@ -171,6 +225,9 @@ class _Planner:
         )
         if not tasks:
             raise OutlapError(f"table {name}: has no tasks; give the task set {task_set} {table.circuits} circuits")
+        for task in tasks:
+            find_entry(task.track)
+            changed(self._env(task_set), task.changes)
         # As many on every task as make the budget's episodes, or a few more.
         episodes = -(-round(self.budget.episodes * table.share) // len(tasks))
         races = []
@@ -192,6 +249,7 @@ class _Planner:
                         tasks=tasks,
                         episodes=episodes,
                         time_limit=table.time_limit,
+                        score=PAPER_REWARD,
                         driver=method.driver,
                         training=training,
                         adaptation=adaptation,
@@ -202,11 +260,8 @@ class _Planner:
 
     def _env(self, task_set: str) -> RaceConfig:
         """The task set's cars and sensors, as every method is tested with them."""
-        from outlap.training.ppo import PPOConfig
-
         everywhere = self.budget.training.get("all", {}).get("env", {})
-        env = changed(PPOConfig().env, everywhere, self.task_sets[task_set].env)
-        return env.model_copy(update={"reward": PAPER_REWARD})
+        return changed(PPOConfig().env, everywhere, self.task_sets[task_set].env)
 
     def _training(self, task_set: str, method: Method, seed: int) -> TrainingUnit:
         """The training of a method, the same unit for all that are trained alike."""

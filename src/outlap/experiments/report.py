@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import yaml
 
@@ -24,8 +25,9 @@ from outlap.experiments.results import (
     read_rows,
     table_result,
 )
-from outlap.experiments.units import OpponentUnit, done_record
+from outlap.experiments.units import COLLECTING_WORLDS, OpponentUnit, adaptation_settings, done_record
 from outlap.files import atomic_write, to_json
+from outlap.mql.propensity import CLIP_RULES
 from outlap.training.run import provenance
 
 APPENDIX_TITLES = {
@@ -34,7 +36,7 @@ APPENDIX_TITLES = {
     ("tracks", "vanilla-dr"): "Appendix E: Vanilla DR learns many tracks",
     ("tracks", "mql-abc"): "Appendix F: MQL is meta-trained on many tracks",
 }
-PAPER_RATIO = 2.23e-6 / 8.40e-7  # of the critic loss's variance without ABC to that with it
+PAPER_VARIANCES = {"fixed": 2.23e-6, "abc": 8.40e-7}  # of the critic loss, by clip rule
 
 
 def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
@@ -52,17 +54,21 @@ def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
     rows = read_rows(plan, work)
     results = [table_result(plan, table, rows) for table in plan.tables]
     document = Document(folder)
+    document.clear()
+    (folder / ROWS).unlink(missing_ok=True)
     document.text(f"# outlap: the paper's experiments, budget `{plan.budget_name}`")
     document.text(_introduction(plan, work))
     for result in results:
-        _write_table(document, plan, result, titles)
+        _write_table(document, plan, work, result, titles)
     if len(results) > 0:
         document.text("## How far every method comes")
         document.text(
             "Performance profiles: the share of trainings and tasks whose mean progress, as a share of what top speed "
             "would give in the time, is above τ."
         )
-        document.figure("profiles", figures.draw_profiles(results, titles))
+        heading = "How far every method comes"
+        document.figure("profiles", figures.draw_profiles(results, titles, heading))
+        _write_effort(document, results, titles, work)
     data: dict[str, Any] = {"tables": {result.plan.name: entries(result) for result in results}}
     data["comparisons"] = {result.plan.name: [asdict(each) for each in result.comparisons] for result in results}
     if plan.clipping:
@@ -75,7 +81,7 @@ def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
         "budget": plan.budget,
         "methods": plan.methods,
         "task_sets": plan.task_sets,
-        "circuits": plan.circuits,
+        "circuits": {table.name: plan.circuits[table.task_set] for table in plan.tables},
     }
     _write_record(document, plan, record)
     data["record"] = record
@@ -99,15 +105,18 @@ def _introduction(plan: Plan, work: Path) -> str:
     )
 
 
-def _write_table(document: Document, plan: Plan, result: TableResult, titles: Mapping[str, str]) -> None:
+def _write_table(document: Document, plan: Plan, work: Path, result: TableResult, titles: Mapping[str, str]) -> None:
     table = result.plan
     race = table.races[0]
-    document.text(f"## {result.title}; {plan.circuits[table.task_set].title}")
+    title = f"{result.title}; {plan.circuits[table.task_set].title}"
+    document.text(f"## {title}")
     names = ", ".join(dict.fromkeys(task.track for task in race.tasks))
     document.text(
         f"{len(race.tasks)} tasks on {names}; {race.episodes} races of {race.time_limit:g} s on each, for every method "
         "and training."
     )
+    if race.population is not None:
+        document.text(_verification(race.population.opponents, work))
     paper = [
         metric for metric in result.metrics if any(row[metric].published is not None for row in result.cells.values())
     ]
@@ -130,7 +139,7 @@ def _write_table(document: Document, plan: Plan, result: TableResult, titles: Ma
             for method, row in result.cells.items()
         ],
     )
-    document.figure(table.name, figures.draw_intervals(result.cells, ("crashes", "progress_m"), titles, result.title))
+    document.figure(table.name, figures.draw_intervals(result.cells, ("crashes", "progress_m"), titles, title))
     if result.comparisons:
         document.text("### What this shows")
         document.table(
@@ -181,42 +190,58 @@ def _read_clipping(plan: Plan, work: Path, name: str) -> pd.DataFrame:
 
 
 def _write_clipping(document: Document, plan: Plan, work: Path) -> dict[str, Any]:
+    """Figure 2: numbers of every rule, and ABC's against the others'."""
     updates, gradients = _read_clipping(plan, work, "updates"), _read_clipping(plan, work, "gradients")
-    document.text(f"## Figure 2: what clipping does to adaptation; {plan.circuits[CLIPPING_TASKS].title}")
+    iterations = _read_clipping(plan, work, "iterations")
+    unit = ["seed", "adaptation_seed", "rule"]
+    of_losses = updates.pivot_table(index=unit, values="critic_loss", aggfunc="var").reset_index()
+    title = f"Figure 2: what clipping does to adaptation; {plan.circuits[CLIPPING_TASKS].title}"
+    document.text(f"## {title}")
     document.text(
         f"{len(plan.clipping)} adaptations to unseen circuits; for every clip rule the same transitions of the new "
-        "circuit, the same replay and the same batches. The two panels at the upper left are the paper's figure. "
-        "Sample size and the gradient's variance do not change when all weights are scaled by one constant. Lines: "
-        "median over adaptations, with quartiles."
+        "circuit, the same replay and the same batches. The two panels at the upper left are of the weighted loss, as "
+        "the paper's figure is; sample size and the gradient's variance do not change when all weights are scaled by "
+        "one constant. Lines: median over adaptations, with quartiles."
     )
-    document.figure("figure-2", figures.draw_figure_2(updates, gradients))
+    document.figure("figure-2", figures.draw_figure_2(updates, gradients, title))
+    numbers = (
+        ("loss_variance", "variance of the weighted critic loss over updates", of_losses, "critic_loss"),
+        ("loss_variance_in_batch", "the same over the transitions of a batch", updates, "critic_loss_variance"),
+        ("effective_sample_size", "effective sample size", updates, "effective_sample_size"),
+        ("gradient_variance", "gradient variance over batches, β of mean 1", gradients, "gradient_variance"),
+        ("replay_td_error", "TD error of the replay, β = 1", updates, "td_error"),
+        ("task_td_error", "TD error of the new circuit, β = 1", iterations, "on_task_critic_loss"),
+    )
     found: dict[str, Any] = {}
-    rows = []
-    ratios = (
-        ("variance of the weighted critic loss", updates, "critic_loss_variance", PAPER_RATIO),
-        ("effective sample size", updates, "effective_sample_size", None),
-        ("unweighted TD error", updates, "td_error", None),
-        ("gradient variance, β of mean 1", gradients, "gradient_variance", None),
-    )
-    for label, source, column, paper in ratios:
+    values, comparisons = [], []
+    for name, label, source, column in numbers:
+        paper = PAPER_VARIANCES if name == "loss_variance" else {}
+        medians = {rule: float(np.median(source.loc[source["rule"] == rule, column].to_numpy())) for rule in CLIP_RULES}
+        found[name] = {rule: {"value": medians[rule], "published": paper.get(rule)} for rule in CLIP_RULES}
+        published = [f" (the paper: {paper[rule]:.3g})" if rule in paper else "" for rule in CLIP_RULES]
+        values.append(
+            [label, *(f"{medians[rule]:.3g}{note}" for rule, note in zip(CLIP_RULES, published, strict=True))]
+        )
         for reference in ("none", "fixed"):
             ratio = ratio_over_adaptations(source, "abc", reference, column)
-            published = 1.0 / paper if paper is not None and reference == "none" else None
-            found[f"{column}_abc_over_{reference}"] = {**ratio, "seeds": len(plan.clipping), "published": published}
-            rows.append(
+            theirs = paper["abc"] / paper[reference] if reference in paper else None
+            found[name][f"abc_over_{reference}"] = {**ratio, "published": theirs}
+            comparisons.append(
                 [
                     label,
                     figures.RULES[reference],
                     f"{ratio['value']:.3g} [{ratio['low']:.3g}, {ratio['high']:.3g}]",
-                    f"{published:.2g}" if published else "",
+                    f"{theirs:.2g}" if theirs else "",
                     _ratio_claim(ratio),
                 ]
             )
+    document.text("Medians over all adaptations:")
+    document.table(["number", *(figures.RULES[rule] for rule in CLIP_RULES)], values)
     document.text(
-        "ABC over another rule: geometric mean of the ratio over adaptations [95 %]. Below 1: ABC's is the smaller. "
-        "Adaptations that start from one training are not independent: the intervals are for these trainings."
+        f"ABC over another rule: geometric mean of the ratio [95 %]; the unit is the training, of which there are "
+        f"{len({unit.seed for unit in plan.clipping})}. Below 1: ABC's is the smaller."
     )
-    document.table(["number", "ABC over", "ratio", "the paper", "shown"], rows)
+    document.table(["number", "ABC over", "ratio", "the paper", "shown"], comparisons)
     return found
 
 
@@ -232,7 +257,7 @@ def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
         curves = {
             f"{unit.max_speed_mps:g} m/s": [figures.read_learning(_opponent_run(unit, work))] for unit in plan.opponents
         }
-        document.text("### A: opponents of every top speed learn", _verification(plan, work))
+        document.text("### A: opponents of every top speed learn", _verification(plan.opponents, work))
         document.figure("appendix-a", figures.draw_learning(curves, "Appendix A: PPO for every top speed"))
     else:
         document.text(
@@ -249,24 +274,51 @@ def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
         if letter == "C":
             document.text("### D: β and ABC's β during adaptation")
             histograms, updates = _read_clipping(plan, work, "histograms"), _read_clipping(plan, work, "updates")
-            document.figure("appendix-d", figures.draw_weights(histograms, updates))
+            title = f"Appendix D: β and ABC's β during adaptation; {plan.circuits[CLIPPING_TASKS].title}"
+            document.figure("appendix-d", figures.draw_weights(histograms, updates, title))
 
 
 def _opponent_run(unit: OpponentUnit, work: Path) -> Path:
     return unit.folder(work) / "runs" / unit.name
 
 
-def _verification(plan: Plan, work: Path) -> str:
+def _verification(opponents: Sequence[OpponentUnit], work: Path) -> str:
     """Which opponents completed their laps."""
     failed = []
-    for unit in plan.opponents:
+    for unit in opponents:
         laps = pd.read_parquet(unit.folder(work) / ROWS)["completed_laps"].to_numpy()
         if (laps < unit.laps).any():
             failed.append(unit.name)
-    first = plan.opponents[0]
-    passed = f"{len(plan.opponents) - len(failed)} of {len(plan.opponents)} completed {first.laps} laps"
+    first = opponents[0]
+    passed = f"{len(opponents) - len(failed)} of {len(opponents)} opponents completed {first.laps} laps"
     left_out = f"; left out of all races: {', '.join(failed)}" if failed else ""
-    return f"{passed} from each of {first.starts} standing starts{left_out}."
+    return f"{passed} from each of {first.starts} standing starts, alone on {first.track}{left_out}."
+
+
+def _write_effort(document: Document, results: Sequence[TableResult], titles: Mapping[str, str], work: Path) -> None:
+    """What each method was trained with, and what it saw of the tasks that it is tested on."""
+    document.text("## What went into every method")
+    rows = []
+    for method in next(iter(results)).cells:
+        races = [race for result in results for race in result.plan.races if race.method == method]
+        trainings = {race.training.key: race.training for race in races if race.training}
+        actions = sorted({unit.config.total_steps for unit in trainings.values()})
+        minutes = [float(done_record(unit, work)["seconds"]) / 60.0 for unit in trainings.values()]
+        adapts = next((race.adaptation for race in races if race.adaptation is not None), None)
+        settings = adaptation_settings(adapts) if adapts is not None else None
+        seen = settings.iterations * settings.collect_steps * COLLECTING_WORLDS if settings else 0
+        rows.append(
+            [
+                titles[method],
+                ", ".join(f"{number:,}" for number in actions) or "none",
+                f"{sum(minutes) / len(minutes):.1f}" if minutes else "0",
+                f"{seen:,}" if seen else "none",
+            ]
+        )
+    document.table(
+        ["method", "actions of a training", "core minutes of one, mean", "actions on each test task before the races"],
+        rows,
+    )
 
 
 def _core_seconds(plan: Plan, work: Path) -> dict[str, float]:

@@ -240,19 +240,26 @@ def entries(result: TableResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def ratio_over_adaptations(updates: pd.DataFrame, rule: str, reference: str, column: str) -> dict[str, float]:
+def ratio_over_adaptations(updates: pd.DataFrame, rule: str, reference: str, column: str) -> dict[str, Any]:
     """How a number of one clip rule's updates compares with another's on the same batches.
 
     Args:
-        updates: rows with `adaptation_seed`, `rule` and the column.
+        updates: rows with `seed` (of the training), `adaptation_seed`, `rule` and the column.
         rule, reference: names of clip rules.
-        column: positive numbers; their median over the updates of each adaptation is taken.
+        column: positive numbers, one an adaptation; where there are more, their median is taken.
 
     Returns:
-        The geometric mean of the ratio over adaptations as `value`, with Student's t interval of its logarithm.
+        The geometric mean of the ratio as `value`, with Student's t interval of its logarithm over trainings, each of
+        which is the mean of its adaptations; how many `seeds` and `adaptations` there are.
     """
-    medians = updates.pivot_table(index="adaptation_seed", columns="rule", values=column, aggfunc="median")
-    logs = np.log(medians[rule].to_numpy(np.float64) / medians[reference].to_numpy(np.float64))
-    estimate = estimate_mean(logs)
+    medians = updates.pivot_table(index=["seed", "adaptation_seed"], columns="rule", values=column, aggfunc="median")
+    logs = pd.DataFrame(
+        {
+            "seed": medians.index.get_level_values("seed"),
+            "log": np.log(medians[rule].to_numpy(np.float64) / medians[reference].to_numpy(np.float64)),
+        }
+    )
+    estimate = estimate_mean(logs.pivot_table(index="seed", values="log").to_numpy(np.float64)[:, 0])
     ends = {"value": estimate.mean, "low": estimate.low, "high": estimate.high}
-    return {name: math.exp(end) if math.isfinite(end) else math.nan for name, end in ends.items()}
+    found = {name: math.exp(end) if math.isfinite(end) else math.nan for name, end in ends.items()}
+    return {**found, "seeds": int(medians.index.get_level_values("seed").nunique()), "adaptations": len(medians)}

@@ -12,6 +12,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,6 @@ from outlap.processes import process_environment
 log = logging.getLogger(__name__)
 
 POLL = 0.5  # [s] between two looks at how far units are
-NO_UNIT = -1
 
 
 @dataclass(frozen=True)
@@ -67,25 +67,30 @@ def _run_units(units: Sequence[Unit], work: Path, jobs: int, on_status: Callable
     pace = _Pace(units, work, jobs)
     waiting = [unit for unit in units if not unit.is_done(work)]
     done = {unit.key for unit in units if unit.is_done(work)}
-    failed: dict[str, str] = {}
+    failed: dict[str, tuple[Unit, str]] = {}  # by key, with the reason
+    suspects: set[str] = set()  # keys of units whose process died, or one beside it: each is tried once more, alone
     if not waiting:
         return
     context = multiprocessing.get_context("spawn")
     shares, stop = context.Array("d", len(units)), context.Event()
     numbers = {unit.key: number for number, unit in enumerate(units)}
+
+    def new_pool() -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(shares, stop))
+
     with process_environment(NUMBA_NUM_THREADS="1", OMP_NUM_THREADS="1"):
-        pool = ProcessPoolExecutor(
-            min(jobs, len(waiting)), mp_context=context, initializer=_start_worker, initargs=(shares, stop)
-        )
+        pool = new_pool()
         running: dict[Future[float], Unit] = {}
         try:
             while waiting or running:
                 for unit in list(waiting):
-                    if len(running) == jobs:
+                    if len(running) == jobs or any(other.key in suspects for other in running.values()):
                         break
-                    if any(needed.name in failed for needed in unit.needs):
+                    if unit.key in suspects and running:
+                        continue
+                    if any(needed.key in failed for needed in unit.needs):
                         waiting.remove(unit)
-                        failed[unit.name] = "needs one that failed"
+                        failed[unit.key] = unit, "needs one that failed"
                     elif all(needed.key in done for needed in unit.needs):
                         waiting.remove(unit)
                         running[pool.submit(_do, unit, work, numbers[unit.key])] = unit
@@ -98,11 +103,21 @@ def _run_units(units: Sequence[Unit], work: Path, jobs: int, on_status: Callable
                     if error is None:
                         done.add(unit.key)
                         pace.note(unit, future.result())
-                    elif isinstance(error, Exception) and not isinstance(error, KeyboardInterrupt):
+                    elif isinstance(error, BrokenProcessPool) and unit.key not in suspects:
+                        suspects.add(unit.key)
+                        waiting.insert(0, unit)
+                    elif isinstance(error, Exception):
                         log.warning("%s failed: %s", unit.name, error)
-                        failed[unit.name] = f"{type(error).__name__}: {error}"
+                        failed[unit.key] = unit, f"{type(error).__name__}: {error}"
                     else:
                         raise error
+                if any(isinstance(future.exception(), BrokenProcessPool) for future in finished):
+                    wait(running)  # all of them have the same error
+                    suspects |= {unit.key for unit in running.values()}
+                    waiting[:0] = running.values()
+                    running.clear()
+                    pool.shutdown()
+                    pool = new_pool()
                 if on_status is not None:
                     under_way = {unit: shares[numbers[unit.key]] for unit in running.values()}
                     on_status(pace.status(under_way, len(done), [*waiting, *running.values()]))
@@ -110,10 +125,10 @@ def _run_units(units: Sequence[Unit], work: Path, jobs: int, on_status: Callable
             stop.set()  # after an error or Ctrl-C, those that still work save and go
             pool.shutdown(wait=True)
     if failed:
-        first = next(iter(failed))
+        unit, reason = next(iter(failed.values()))
         raise OutlapError(
-            f"{len(failed)} of {len(units)} units of work failed, {first} first ({failed[first]}); what is done "
-            "is kept, and the same command tries again"
+            f"{len(failed)} of {len(units)} units of work failed, {unit.name} first ({reason}); what is done is kept: "
+            "the same command tries again, and other --methods or tables go without it"
         )
 
 
@@ -161,6 +176,14 @@ def _start_worker(shares: Any, stop: Any) -> None:
 
 def _do(unit: Unit, work: Path, number: int) -> float:
     """Do a unit in a worker; returns the seconds that it took, earlier sessions included."""
+    folder = unit.folder(work)
+    folder.mkdir(parents=True, exist_ok=True)
+    # Whoever was at work here before, and has lost its parent, may still be saving.
+    with FileLock(folder / ".lock"):
+        return _do_locked(unit, work, number)
+
+
+def _do_locked(unit: Unit, work: Path, number: int) -> float:
     parent = multiprocessing.parent_process()
     folder = unit.folder(work)
     before = _seconds_before(folder)

@@ -19,10 +19,13 @@ import pandas as pd
 
 from outlap.drivers.driver import Driver
 from outlap.envs.race_config import RaceConfig
+from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.definitions import changed
 from outlap.files import atomic_write, to_json
+from outlap.training.mql import MQLConfig
+from outlap.training.ppo import PPOConfig
 from outlap.training.session import TrainingConfig
 
 if TYPE_CHECKING:
@@ -143,7 +146,7 @@ class PopulationUnit(Unit):
         failed = [unit.name for unit in self.opponents if unit not in passed]
         atomic_write(folder / "failed.json", to_json(failed))
         held_out = [unit.name for unit in self.opponents if unit.split == "held_out" and unit not in passed]
-        if held_out or len(passed) == len(self.opponents) - len(failed) == 0:
+        if held_out or all(unit.split == "held_out" for unit in passed):
             raise OutlapError(
                 f"opponents {', '.join(failed)}: did not complete {self.opponents[0].laps} laps from every start; "
                 "give the budget's population more total_steps"
@@ -161,10 +164,16 @@ class TrainingUnit(Unit):
     @property
     def seconds(self) -> float:
         config = self.config
-        rate = {"ppo": 9_000, "recurrent-ppo": 3_700, "mql": 2_500}[config.algorithm]
-        if not getattr(config, "uses_context", True):
-            rate = 3_600
-        return 5.0 + config.total_steps / rate * (1.3 if config.env.num_cars > 1 else 1.0)
+        rate = {"ppo": 11_000, "recurrent-ppo": 3_500}.get(config.algorithm, 30_000)  # actions a second
+        beams = (1.0 + config.env.beams / 540) * (1.5 if config.env.num_cars > 1 else 1.0)
+        seconds = config.total_steps / rate * beams / 1.2
+        if isinstance(config, MQLConfig):
+            updates = config.total_steps / config.num_envs * config.updates_per_step * config.batch_size / 256
+            each = {"fast": 0.027, "paper": 0.12}[config.preset] * (1.0 if config.uses_context else 0.65)
+            seconds += updates * each
+        elif isinstance(config, PPOConfig):  # many small batches cost more than few large ones
+            seconds += config.total_steps / config.batch_size * config.n_epochs * 0.003
+        return 2.0 + seconds
 
     def do(self, work: Path, report: Report) -> None:
         from outlap.training.run import load_run
@@ -220,6 +229,7 @@ class RaceUnit(Unit):
     tasks: tuple[Task, ...]
     episodes: int  # on every task
     time_limit: float
+    score: RewardConfig  # that rewards and returns are told in, whatever a method was trained with
     driver: str | None = None
     training: TrainingUnit | None = None
     adaptation: Mapping[str, Any] | None = None
@@ -228,12 +238,11 @@ class RaceUnit(Unit):
     @property
     def seconds(self) -> float:
         steps = len(self.tasks) * self.episodes * self.time_limit / 0.04
-        each = 4.0
+        each = 0.4
         if self.adaptation is not None:
             settings = adaptation_settings(self.adaptation)
-            updates = settings.iterations * (settings.on_task_steps + settings.replay_steps)
-            each += 0.028 * updates + 0.005 * settings.iterations * settings.collect_steps
-        return 5.0 + steps / 8_000 + each * len(self.tasks)
+            each += 0.5 + _seconds_of_adaptation(settings) + 0.004 * settings.iterations * settings.collect_steps
+        return 1.0 + steps / 8_000 * (1.5 if self.env.num_cars > 1 else 1.0) + each * len(self.tasks)
 
     def do(self, work: Path, report: Report) -> None:
         from outlap.evaluation.rollout import EvaluationProgress, evaluate, standing_starts
@@ -244,6 +253,7 @@ class RaceUnit(Unit):
         for number, task in enumerate(self.tasks):
             track = Track.load(task.track)
             env = resolve(changed(self.env, task.changes), self.population, work)
+            env = env.model_copy(update={"reward": self.score})
             races = standing_starts(env, [track], laps=0, time_limit=self.time_limit)
 
             def progress(now: EvaluationProgress, number: int = number) -> None:
@@ -275,7 +285,8 @@ class RaceUnit(Unit):
             meta, collecting(self.training, task, work, self.seed), settings, seed=self.seed,
             on_iteration=lambda done, _: report((done + 1) / settings.iterations),
         )  # fmt: skip
-        return PolicyDriver(adapted, scale_observations=self.training.config.env.scale_observations)
+        trained = self.training.config.env
+        return PolicyDriver(adapted, scale_observations=trained.scale_observations, reward=trained.reward)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,8 +303,7 @@ class ClippingUnit(Unit):
 
     @property
     def seconds(self) -> float:
-        settings = adaptation_settings({"clip": "abc", **self.settings})
-        return 10.0 + 3 * 0.028 * settings.iterations * (settings.on_task_steps + settings.replay_steps)
+        return 5.0 + 3 * _seconds_of_adaptation(adaptation_settings({"clip": "abc", **self.settings}))
 
     def do(self, work: Path, report: Report) -> None:
         from outlap.experiments.clipping import compare_rules
@@ -301,11 +311,18 @@ class ClippingUnit(Unit):
 
         meta = load_meta(self.training, work)
         base = adaptation_settings({"clip": "abc", **self.settings})
-        new = collect(meta, collecting(self.training, self.task, work, self.adaptation_seed), base)
+        task = collecting(self.training, self.task, work, self.adaptation_seed)
+        new = collect(meta, task, base, seed=self.adaptation_seed)
         found = compare_rules(meta, new, base, self.adaptation_seed, self.batches, report)
         facts = {"seed": self.seed, "adaptation_seed": self.adaptation_seed, "task": self.task.name}
         for name, rows in found.items():
             write_rows(rows.assign(**facts), self.folder(work) / f"{name}.parquet")
+
+
+def _seconds_of_adaptation(settings: AdaptationSettings) -> float:
+    """About how long its updates take."""
+    updates = settings.iterations * (settings.on_task_steps + settings.replay_steps)
+    return 0.025 * updates * settings.batch_size / 256
 
 
 def load_meta(unit: TrainingUnit, work: Path) -> MQL:
@@ -334,12 +351,33 @@ def adaptation_settings(changes: Mapping[str, Any]) -> AdaptationSettings:
     from outlap.mql.adaptation import AdaptationSettings
     from outlap.mql.propensity import CLIP_RULES
 
-    known = {each.name for each in fields(AdaptationSettings)}
-    for name in changes:
-        if name not in known:
-            raise OutlapError(f"adaptation: {name} is not a known field; the fields are {', '.join(sorted(known))}")
-    clip = CLIP_RULES[changes.get("clip", "abc")]()
-    return replace(AdaptationSettings(), **{**changes, "clip": clip})
+    base = AdaptationSettings()
+    constants = {each.name: getattr(base, each.name) for each in fields(base) if each.name != "clip"}
+    wanted = dict(changes)
+    clip = wanted.pop("clip", {"rule": "abc"})
+    rule = dict(clip) if isinstance(clip, Mapping) else {"rule": clip}
+    name = rule.pop("rule", None)
+    if name not in CLIP_RULES:
+        raise OutlapError(
+            f"adaptation: clip is {clip!r}; must be, or have a rule that is, one of {', '.join(CLIP_RULES)}"
+        )
+    clipping = CLIP_RULES[name]()
+    of_rule = {each.name: getattr(clipping, each.name) for each in fields(clipping)}
+    _check_numbers("adaptation", wanted, constants)
+    _check_numbers(f"adaptation: clip {name}", rule, of_rule)
+    return replace(base, **wanted, clip=replace(clipping, **rule))
+
+
+def _check_numbers(where: str, changes: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
+    """Raises OutlapError for a field that is not known, or not a number of its default's kind."""
+    for name, value in changes.items():
+        if name not in defaults:
+            known = ", ".join(defaults) or "none"
+            raise OutlapError(f"{where}: {name} is not a known field; the fields are {known}")
+        whole = isinstance(defaults[name], int)
+        if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or value < 0:
+            kind = "a whole number" if whole else "a number"
+            raise OutlapError(f"{where}: {name} is {value!r}; must be {kind}, 0 or more")
 
 
 def done_record(unit: Unit, work: Path) -> dict[str, Any]:

@@ -70,6 +70,7 @@ class Run:
             seed=seed,
             name=self.folder.resolve().name,
             speeds=(slowest, bounds(env.vehicle.v_max)[1] if fastest is None else fastest),
+            reward=env.reward,
         )
 
     def checkpoints(self) -> list[Path]:
