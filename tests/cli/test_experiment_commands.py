@@ -11,7 +11,7 @@ import pytest
 
 from outlap.cli.main import main
 
-METHODS = ["vanilla-dr", "mql", "mql-abc", "follow-the-gap", "recurrent-ppo"]
+METHODS = ["vanilla-dr", "mql-abc", "follow-the-gap", "recurrent-ppo"]
 SMALLEST = ["--budget", "smoke", "--seeds", "1", "--methods", *METHODS]
 TABLES = ["table-1", "table-2", "table-3", "everything", "vehicles"]
 COLUMNS = {
@@ -39,7 +39,7 @@ def test_everything_comes_from_one_command(made: Path):
             for entry in metrics.values():
                 assert {"value", "low", "high", "seeds", "published"} <= {*entry}
                 assert entry["seeds"] == 1
-    assert data["tables"]["table-1"]["mql"]["crashes"]["published"] == 500
+    assert data["tables"]["table-1"]["mql-abc"]["crashes"]["published"] == 500
     assert data["tables"]["table-3"]["recurrent-ppo"]["crashes"]["published"] is None
     variance = data["figure-2"]["loss_variance"]
     assert (variance["fixed"]["published"], variance["abc"]["published"]) == (2.23e-6, 8.40e-7)

@@ -257,7 +257,7 @@ def test_pure_pursuit_drives_the_planned_lap(circuit):
     assert 0.98 < ratios.min() <= ratios.max() < 1.05
 
 
-@pytest.mark.parametrize("name", ["levine", "YasMarina"])
+@pytest.mark.parametrize("name", ["levine", "IMS"])
 def test_real_circuits_are_lapped_no_slower_than_their_own_racelines(real_tracks: FilePath, name):
     track = Track.load(real_tracks / name)
     theirs = track.raceline

@@ -83,7 +83,7 @@ table {{ border-collapse: collapse; font-size: 0.84rem; font-variant-numeric: ta
 th, td {{ padding: 0.3rem 0.7rem; border-bottom: 1px solid #ddd; text-align: left; white-space: nowrap; }}
 th {{ border-bottom: 2px solid #888; white-space: normal; vertical-align: bottom; }}
 tbody tr:hover {{ background: #0072b214; }}
-img {{ max-width: 100%; height: auto; background: #fff; }}
+img {{ width: min(100%, 50rem); height: auto; background: #fff; }}
 code, pre {{ font: 0.85em ui-monospace, monospace; }} pre {{ overflow-x: auto; background: #f4f4f4; padding: 0.8rem; }}
 @media (prefers-color-scheme: dark) {{ body {{ color: #ddd; background: #16181b; }} pre {{ background: #24272b; }}
   th, td {{ border-color: #444; }} img {{ padding: 0.4rem; }} }}

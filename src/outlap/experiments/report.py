@@ -94,10 +94,11 @@ def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
 
 def _introduction(plan: Plan, work: Path) -> str:
     budget = plan.budget
-    hours = sum(_core_seconds(plan, work).values()) / 3600.0
+    seconds = sum(_core_seconds(plan, work).values())
+    effort = f"{seconds / 3600.0:.1f} core hours" if seconds > 3600.0 else f"{seconds / 60.0:.0f} core minutes"
     trainings = "1 training" if budget.seeds == 1 else f"{budget.seeds} trainings"
     return (
-        f"Budget `{plan.budget_name}`: {budget.title}; {trainings} of every method, {hours:.1f} core hours of work.\n\n"
+        f"Budget `{plan.budget_name}`: {budget.title}; {trainings} of every method, {effort} of work.\n\n"
         "How to read the tables: a number is the mean over trainings with different seeds; in brackets is Student's "
         "95 % interval of that mean, whose unit is the seed. The sd is over episodes, as in the paper. A comparison is "
         "paired by seed and task, and says `better` or `worse` only where the interval of the difference leaves out "
