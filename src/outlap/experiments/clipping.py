@@ -14,7 +14,7 @@ from outlap.mql.adaptation import AdaptationSettings, adapt, features, fit_to
 from outlap.mql.buffers import HistoryBuffer
 from outlap.mql.learner import criticise
 from outlap.mql.mql import MQL
-from outlap.mql.propensity import CLIP_RULES
+from outlap.mql.propensity import CLIP_RULES, effective_sample_size
 
 # log10 of the edges of a histogram of β, which reaches from exp(-30) to exp(30).
 BETA_EDGES = np.linspace(-13.2, 13.2, 133)
@@ -105,7 +105,7 @@ def gradient_variance(
                 if each is not None:
                     total += each / batches
                     square[name] += float(each.square().sum()) / batches
-            size[name] += float(beta.sum() ** 2 / (len(beta) * np.square(beta).sum())) / batches
+            size[name] += effective_sample_size(beta) / batches
     rows = []
     for name in names:
         norm = float(sum(total.square().sum() for total in mean[name]))

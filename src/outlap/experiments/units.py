@@ -64,7 +64,7 @@ class Unit:
         for each in fields(self):
             value = getattr(self, each.name)
             needed = isinstance(value, Unit) or (isinstance(value, tuple) and any(isinstance(v, Unit) for v in value))
-            if not needed and not each.metadata.get("name_only"):
+            if not needed:
                 made_of[each.name] = value
         return hashlib.sha256(to_json(made_of).encode()).hexdigest()[:12]
 
