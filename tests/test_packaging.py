@@ -20,6 +20,8 @@ def test_every_dependency_and_extra_is_pinned_within_its_range() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
     for requirement in map(Requirement, wanted):
+        if requirement.name == project["name"]:  # an extra that takes another one in
+            continue
         version = pins[canonicalize_name(requirement.name)]
         assert requirement.specifier.contains(Version(version)), requirement
     assert pins["torch"] == "2.13.0"

@@ -11,6 +11,7 @@ import pytest
 
 from outlap.cli.main import main
 from outlap.evaluation.metrics import summarise_methods
+from outlap.evaluation.recording import Recording
 from synthetic_tracks import ring
 
 SMALL = [
@@ -37,9 +38,9 @@ def test_train_evaluate_and_adapt(run: Path, capfd: pytest.CaptureFixture[str]) 
     assert main(["evaluate", "run", "--tracks", "ring6", "--episodes", "3", "--time-limit", "2", "--quiet"]) == 0
     capfd.readouterr()
     words = ["run", "--tracks", "ring6", "--seeds", "2", *SHORT, "--time-limit", "2", "--out", "adapted", "--quiet"]
-    assert main(["adapt", *words, "--json", "-"]) == 0
+    assert main(["adapt", *words, "--record", "1", "--json", "-"]) == 0
     data = json.loads(capfd.readouterr()[0])
-    assert set(data) == {"before", "none", "fixed", "abc", "folder"}
+    assert set(data) == {"before", "none", "fixed", "abc", "folder", "recordings"}
     assert (data["before"]["all"]["episodes"], data["abc"]["all"]["episodes"]) == (3, 6)
     assert data["abc"]["all"]["seeds"] == 2
     rows = pd.read_parquet("adapted/episodes.parquet")
@@ -50,6 +51,14 @@ def test_train_evaluate_and_adapt(run: Path, capfd: pytest.CaptureFixture[str]) 
     updates = pd.read_parquet("adapted/updates.parquet")
     assert len(updates) == 2 * 3 * 2
     assert {"beta_mean", "clip_level", "clipped_share", "effective_sample_size", "proximal_weight"} <= set(updates)
+    # The same episode before and after, in this order, with the context that the policy acted on.
+    files = sorted(Path("adapted/recordings").iterdir())
+    assert [file.stem for file in files] == [f"ring6-000-{name}" for name in ("0-before", "1-none", "2-fixed", "3-abc")]
+    recordings = [Recording.load(file) for file in files]
+    assert len({recording.info.seed for recording in recordings}) == 1
+    assert all(recording.context.shape == (len(recording.time), 32) for recording in recordings)
+    assert main(["replay", "adapted", "--out", "adapted.html"]) == 0
+    assert main(["plot", "contexts", "adapted", "--out", "contexts.png"]) == 0
 
 
 def test_wrong_arguments_are_one_line(run: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -125,7 +125,7 @@ WRONG = [
     ({"observation": ("speed",)}, "observation.*'speed'"),
     ({"scale_observations": "perhaps"}, "scale_observations is 'perhaps'"),
     ({"termination": {"timelimit": 3}}, "termination.timelimit is not a known field; did you mean time_limit"),
-    ({"render_mode": "human"}, "render_mode is 'human'"),
+    ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
 ]
 
 
@@ -153,4 +153,4 @@ def test_a_mode_of_autoreset_that_is_not_offered(ellipse, mode):
 @pytest.mark.parametrize("name", ["num_envs", "autoreset_mode"])
 def test_a_single_race_has_no_batch(ellipse, name):
     with pytest.raises(OutlapError, match=name):
-        RaceEnv(tracks=[ellipse], beams=0, **{name: 2})
+        RaceEnv(tracks=[ellipse], beams=0, **{name: 2})  # type: ignore[arg-type]

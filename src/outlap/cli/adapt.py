@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from outlap.cli.arguments import check_least
-from outlap.cli.evaluate import held_out_tracks, unused
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
+from outlap.cli.races import held_out_tracks, unused
+from outlap.cli.recordings import RECORDINGS, record_episodes, with_recordings
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from outlap.track import Track
 
 Rule = Literal["abc", "fixed", "none"]
+BEFORE = -1  # in place of an adaptation's seed
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,10 @@ class Adapt:
     seed: int = 0
     """Of the episodes, and the first of the adaptations."""
 
+    record: int = 0
+    """Of each track's episodes, keep so many, raced before and after the first adaptation with each clip rule, to be
+    looked at with `outlap replay`, `outlap video` or `outlap plot`."""
+
     out: Path | None = None
     """A new or empty folder for the results; by default RUN/adaptations/TIME."""
 
@@ -98,6 +104,7 @@ class Adapt:
 
         for name in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
             check_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)
+        check_least("--record", self.record, 0)
         run = load_run(self.run_folder)
         if run.config.algorithm != "mql":
             raise OutlapError(
@@ -123,10 +130,14 @@ class Adapt:
                 driver = PolicyDriver(policy, scale_observations=races.scale_observations, name=method)
                 raced = evaluate(driver, races, [track], self.episodes, self.seed)
                 rows.append(raced.assign(method=method, adaptation_seed=seed))
+                if seed in (BEFORE, self.seed):
+                    number = min(self.record, self.episodes)
+                    suffix = f"-{self.clip.index(method) + 1 if method in self.clip else 0}-{method}"  # in their order
+                    record_episodes(driver, races, track, self.seed, number, folder / RECORDINGS, method, suffix)
                 update(len(rows), f"{method} on {track.name}: {(raced['outcome'] == CRASH).mean():.1%} crashes")
 
             for track in tracks:
-                race(meta, track, "before", -1)
+                race(meta, track, "before", BEFORE)
                 for seed in range(self.seed, self.seed + self.seeds):
                     for rule in self.clip:
                         task = SB3VecEnv(self.collect_worlds, **{**dict(collecting), "tracks": [track]})
@@ -140,7 +151,8 @@ class Adapt:
         save_results(folder, everything, summary, record)
         write_rows(pd.concat(updates, ignore_index=True), folder / "updates.parquet")
         data = {**summary, "folder": folder}
-        return CommandResult(data, lambda console: _print(console, data))
+        result = CommandResult(data, lambda console: _print(console, data))
+        return with_recordings(result, folder, tracks[0]) if self.record else result
 
 
 def _print(console: Console, data: Mapping[str, Any]) -> None:

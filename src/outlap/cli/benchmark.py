@@ -1,4 +1,4 @@
-"""`outlap benchmark simulator` and `outlap benchmark mql`."""
+"""`outlap benchmark simulator`, `mql` and `racing`."""
 
 from __future__ import annotations
 
@@ -312,14 +312,25 @@ class BenchmarkRacing:
     repeats: int = 3
     """Measurements; the median is reported, with the fastest and the slowest."""
 
+    quiet: FlagCreatePairsOff[bool] = False
+    """Show no progress."""
+
     json: str | None = None
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         if self.worlds < 1 or self.cars < 2 or self.seconds <= 0 or self.repeats < 1:
             raise OutlapError("--cars must be at least 2, --worlds and --repeats at least 1, and --seconds more than 0")
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            row = pool.apply(_measure_racing, (self,))
+        begun, expected = time.monotonic(), round((1 + self.repeats) * self.seconds)
+        with (
+            progress_bar("benchmark", expected, "seconds", self.quiet) as update,
+            multiprocessing.get_context("spawn").Pool(1) as pool,
+        ):
+            measured = pool.apply_async(_measure_racing, (self,))
+            while not measured.ready():
+                measured.wait(0.5)
+                update(int(time.monotonic() - begun), "")
+            row = measured.get()
         data = {"rows": [row], "cores": os.cpu_count(), "machine": platform.platform()}
         return CommandResult(data, lambda console: _print_racing(console, row))
 

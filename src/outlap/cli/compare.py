@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from outlap.cli.arguments import check_least
-from outlap.cli.evaluate import find_subject, held_out_tracks, unused
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
+from outlap.cli.races import find_subject, held_out_tracks, unused
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:

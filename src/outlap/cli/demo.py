@@ -47,7 +47,9 @@ class Demo:
         config = validate(MQLConfig, settings, "outlap demo")
         folder = self.out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
         trained = TrainMQL(settings=config, out=folder, quiet=self.quiet).run()
-        adapted = Adapt(folder, clip=("abc",), seeds=1, episodes=self.episodes, seed=self.seed, quiet=self.quiet).run()
+        adapted = Adapt(
+            folder, clip=("abc",), seeds=1, episodes=self.episodes, seed=self.seed, record=1, quiet=self.quiet
+        ).run()
 
         def show(console) -> None:
             trained.show(console)

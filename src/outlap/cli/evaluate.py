@@ -8,14 +8,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
-from outlap.config import bounds
-from outlap.drivers.find import find_drivers
+from outlap.cli.progress import progress_bar
+from outlap.cli.races import Flag, RaceFlags, check_positive, held_out_tracks, is_run, unused
+from outlap.cli.recordings import RECORDINGS, record_episodes, with_recordings
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -28,11 +29,9 @@ if TYPE_CHECKING:
     from outlap.track import Track
     from outlap.training.run import Run
 
-Flag = FlagCreatePairsOff[bool]
 
-
-@dataclass(frozen=True)
-class Evaluate:
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(RaceFlags):
     """Race a driver on tracks, from a standstill anywhere on the lap, and measure it.
 
     The episodes are settled in advance by --seed, the same ones for every driver. The car is that of the
@@ -41,10 +40,6 @@ class Evaluate:
 
     driver: Annotated[Positional[str], arg(metavar="RUN")]
     """A run folder of `outlap train`, an opponent such as population/NAME, or a driver without one: pure-pursuit."""
-
-    task: str | None = None
-    """A run folder: race as in its training, its cars with their ranges, on its held-out tracks; of a driver that has a
-    scanner and a top speed of its own, those stay. By default the driver's own task."""
 
     tracks: tuple[str, ...] = ()
     """Names or map folders; by default the run's held-out tracks, or else the built-in held-out ones."""
@@ -58,35 +53,14 @@ class Evaluate:
     time_limit: float | None = None
     """[s] of an episode; by default enough for one lap more than --laps at 1 m/s."""
 
-    v_max: float | None = None
-    """[m/s] top speed of the cars, in place of the run's; what the policy commands stays within what it learnt."""
-
-    num_cars: int | None = None
-    """The driver's car and opponents; by default as many as the run was trained with."""
-
-    opponents: tuple[str, ...] = ()
-    """Drivers and populations to draw opponents from, in place of the run's; one where the run had none."""
-
-    opponent_code: Flag = False
-    """Load opponents that can run code when they are loaded: run folders, module:function."""
-
-    opponent_split: Literal["train", "held_out"] = "held_out"
-    """The half of a population that opponents are drawn from."""
-
-    racing_line: Literal["track", "min-curvature", "min-time"] | None = None
-    """That pure pursuit follows, in place of the run's: the track's own, or one planned for the car."""
-
-    formation: Literal["queue", "behind", "grid", "scattered"] | None = None
-    """In which the cars start, in place of the run's; behind: the driver's car is the last."""
-
-    seed: int = 0
-    """Of the episodes."""
-
     worlds: int = 128
     """Episodes raced at once; changes the speed, and not the results."""
 
     stochastic: Flag = False
     """Draw actions from the policy's distribution, as in training; then results depend on --worlds too."""
+
+    record: int = 0
+    """Of each track's episodes, keep so many to be looked at with `outlap replay`, `outlap video` or `outlap plot`."""
 
     out: Path | None = None
     """A new or empty folder for the results; by default RUN/evaluations/TIME."""
@@ -100,24 +74,19 @@ class Evaluate:
     def run(self) -> CommandResult:
         self._check_flags()
         from outlap.envs.tasks import load_tracks
-        from outlap.evaluation.rollout import made_for, standing_starts
-        from outlap.training.run import load_run
+        from outlap.evaluation.rollout import standing_starts
 
         if self.stochastic and not is_run(self.driver):
             raise OutlapError(f"--stochastic is for a trained run; {self.driver} draws nothing")
-        driver, trained_env, run = find_subject(self.driver, deterministic=not self.stochastic, seed=self.seed)
-        task = run
-        if self.task is not None:
-            task = load_run(self.task)
-            trained_env = made_for(driver, task.config.env)
-        tracks = load_tracks(self.tracks or held_out_tracks(task))
-        env = self._as_asked(with_top_speed(trained_env, self.v_max))
-        if self.racing_line and env.num_cars == 1 and "line_ahead" not in driver.observation_terms:
-            raise OutlapError(f"--racing-line is {self.racing_line}; {driver.name} follows no line")
-        env = standing_starts(env, tracks, self.laps, self.time_limit)
+        if self.stochastic and self.record:
+            raise OutlapError("--record is of episodes that can be raced again; leave --stochastic out")
+        found = self.subject(self.driver, deterministic=not self.stochastic)
+        driver, run = found.driver, found.run
+        tracks = load_tracks(self.tracks or held_out_tracks(found.task))
+        env = standing_starts(found.env, tracks, self.laps, self.time_limit)
         home = run.folder if run else Path("runs") / driver.name
         folder = self.out or unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
-        return evaluate_into(
+        result = evaluate_into(
             folder,
             driver,
             env,
@@ -129,64 +98,32 @@ class Evaluate:
             facts={"stochastic": self.stochastic},
             quiet=self.quiet,
         )
+        if not self.record:
+            return result
+        number = min(self.record, self.episodes)
+        with progress_bar("recording", number * len(tracks), "episodes", self.quiet) as update:
+            done: list[Path] = []
+
+            def recorded(path: Path) -> None:
+                done.append(path)
+                update(len(done), path.name)
+
+            for track in tracks:
+                record_episodes(driver, env, track, self.seed, number, folder / RECORDINGS, on_recorded=recorded)
+        return with_recordings(result, folder, tracks[0])
 
     def _check_flags(self) -> None:
+        self.check_races()
         for flag, value, least in (
             ("--episodes", self.episodes, 1),
             ("--laps", self.laps, 0),
-            ("--seed", self.seed, 0),
             ("--worlds", self.worlds, 1),
-            ("--num-cars", 1 if self.num_cars is None else self.num_cars, 1),
+            ("--record", self.record, 0),
         ):
             check_least(flag, value, least)
-        for flag, number in (("--time-limit", self.time_limit), ("--v-max", self.v_max)):
-            if number is not None and not 0.0 < number < float("inf"):
-                raise OutlapError(f"{flag} is {number}; must be > 0")
+        check_positive("--time-limit", self.time_limit)
         if self.laps == 0 and self.time_limit is None:
             raise OutlapError("--laps is 0; must be 1 or more, or be given with a --time-limit")
-
-    def _as_asked(self, env: RaceConfig) -> RaceConfig:
-        changes: dict[str, Any] = {"opponent_split": self.opponent_split}
-        if self.num_cars is not None:
-            changes["num_cars"] = self.num_cars
-        if self.opponents:
-            changes |= {"num_cars": max(2, env.num_cars), **changes, "opponents": self.opponents}
-        if self.opponent_code:
-            changes["opponent_code"] = True
-        if self.racing_line is not None:
-            changes["racing_line"] = self.racing_line
-        if self.formation:
-            changes["start"] = env.start.model_copy(update={"formation": self.formation})
-        return env.model_copy(update=changes)
-
-
-def is_run(name: str) -> bool:
-    """Whether a driver's name is that of a run folder."""
-    return (Path(name) / "config.yaml").is_file()
-
-
-def find_subject(name: str, *, deterministic: bool = True, seed: int = 0) -> tuple[Driver, RaceConfig, Run | None]:
-    """The one driver that a name stands for, the environment that it is made for, and its run if it has one.
-
-    Args:
-        name: a run folder, or what `drivers.find` knows.
-        deterministic, seed: see `PolicyDriver`; of a run's policy.
-
-    Raises OutlapError for a name that stands for nobody, or for many.
-    """
-    from outlap.evaluation.rollout import made_for
-    from outlap.training.ppo import PPOConfig
-    from outlap.training.run import load_run
-
-    if is_run(name):
-        run = load_run(name)
-        return run.driver(deterministic=deterministic, seed=seed), run.config.env, run
-    env = PPOConfig().env
-    drivers = find_drivers([name], env.field_of_view, split=None, run_code=True)
-    if len(drivers) > 1:
-        names = ", ".join(driver.name for driver in drivers)
-        raise OutlapError(f"{name}: is a population; name one of its drivers, {name}/NAME: {names}")
-    return drivers[0], made_for(drivers[0], env), None
 
 
 def evaluate_into(
@@ -217,7 +154,6 @@ def evaluate_into(
 
     Raises OutlapError for a folder that is not empty or cannot be written, and what `evaluate` raises.
     """
-    from outlap.cli.progress import progress_bar
     from outlap.evaluation.metrics import summarise
     from outlap.evaluation.results import prepare_folder, save_results
     from outlap.evaluation.rollout import evaluate
@@ -345,24 +281,6 @@ def _cell(summary: Mapping[str, Any], column: str) -> str:
     )
 
 
-def held_out_tracks(run: Run | None) -> tuple[str, ...]:
-    """Names of the tracks that a run has kept from its training, or else the built-in ones."""
-    from outlap.track.generate import BUILTIN_HELD_OUT
-
-    return (run.config.held_out_tracks if run else ()) or BUILTIN_HELD_OUT
-
-
-def with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
-    """The task with another top speed of the cars; actions go on to mean the speeds that they were trained with."""
-    if v_max is None:
-        return env
-    vehicle = env.vehicle.model_copy(update={"v_max": v_max})
-    speeds = env.speed_range or (bounds(env.vehicle.v_min)[0], None)
-    if speeds[1] is None:
-        speeds = (speeds[0], bounds(env.vehicle.v_max)[1])
-    return env.model_copy(update={"vehicle": vehicle, "speed_range": speeds})
-
-
 def _trained_on(run: Run | None, tracks: Sequence[str]) -> list[str]:
     """Those of the tracks that the run was trained on."""
     from outlap.track.catalog import name_key
@@ -383,9 +301,3 @@ def _policy_record(run: Run | None) -> dict[str, Any]:
         "policy": path.relative_to(run.folder),
         "policy_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
     }
-
-
-def unused(folder: Path) -> Path:
-    """This folder, or one numbered like it where two evaluations begin in the same second."""
-    numbered = (folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))
-    return next(path for path in (folder, *numbered) if not path.exists())

@@ -115,7 +115,7 @@ class RecordLap:
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
-        from outlap.cli.evaluate import find_subject, with_top_speed
+        from outlap.cli.races import find_subject, with_top_speed
         from outlap.drivers.ghost import Ghost
         from outlap.evaluation.recording import record_lap
         from outlap.track import Track

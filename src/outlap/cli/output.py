@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +49,21 @@ def check_json_path(path: str | None) -> None:
         raise OutlapError(f"--json {path}: cannot make the folder {folder}: {error.strerror}") from None
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutlapError(f"--json {path}: the folder {folder} cannot be written to")
+
+
+def check_output_path(path: Path, endings: Sequence[str]) -> None:
+    """Make the folder of a command's `--out` now, and see that a file of one of these endings can be written.
+
+    Raises OutlapError where it cannot.
+    """
+    if path.suffix.lower() not in endings:
+        raise OutlapError(f"--out is {path}; must end in {' or '.join(endings)}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutlapError(f"--out {path}: cannot make the folder {path.parent}: {error.strerror}") from None
+    if path.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
+        raise OutlapError(f"--out {path}: cannot be written; give another file")
 
 
 def deliver(result: CommandResult, json_path: str | None) -> None:

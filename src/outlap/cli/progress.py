@@ -53,13 +53,13 @@ def _bar(what: str, total: int, unit: str) -> Iterator[Callable[[int, str], None
 
 
 def _lines(what: str, total: int, unit: str) -> Callable[[int, str], None]:
-    latest = time.monotonic()
+    latest, over = time.monotonic(), False
 
     def update(done: int, note: str) -> None:
-        nonlocal latest
+        nonlocal latest, over
         now = time.monotonic()
-        if done >= total or now - latest >= SECONDS_BETWEEN_LINES:
-            latest = now
+        if (done >= total and not over) or now - latest >= SECONDS_BETWEEN_LINES:
+            latest, over = now, done >= total
             print(f"{what}: {min(done, total):,} of {total:,} {unit} {note}", file=sys.stderr, flush=True)
 
     return update

@@ -161,6 +161,13 @@ class PolicyDriver:
             self._random = torch.get_rng_state()
         return actions
 
+    def context(self) -> np.ndarray | None:
+        """What a policy with a context made of the steps before its last actions: (n, hidden); None without one."""
+        policy: Any = self._policy
+        if not getattr(policy, "uses_context", False) or not self._memories:
+            return None
+        return np.concatenate([policy.context_of(memory) for memory in self._memories])[: len(self._begins)]
+
     def _act(self, observation: dict[str, np.ndarray], count: int) -> np.ndarray:
         if len(self._begins) != count:  # other cars than before
             self.begin(np.ones(count, bool))

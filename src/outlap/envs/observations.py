@@ -178,6 +178,12 @@ def observation_space(
     return gym.spaces.Dict(spaces)
 
 
+def scale_of(name: str, size: int) -> np.ndarray:
+    """What a term of `size` numbers is divided by where observations are scaled: float32 (size,)."""
+    term = OBSERVATION_TERMS[name]
+    return _repeated(term.scale, term.size, size)
+
+
 @lru_cache
 def _repeated(block: tuple[float, ...], size: int, count: int) -> np.ndarray:
     """A term's constants, given for a block of numbers or for all, for all of its numbers: float32 (count,)."""
@@ -194,8 +200,7 @@ def observe(race: Race, car: int, terms: Sequence[str], scaled: bool) -> dict[st
         value = term.read(race, car)
         if scaled:
             # Divided as the space's bounds are: times the reciprocal could round to just outside of them.
-            scale = _repeated(term.scale, term.size, value.shape[1])
-            observation[name] = np.divide(value, scale, dtype=np.float32)
+            observation[name] = np.divide(value, scale_of(name, value.shape[1]), dtype=np.float32)
         else:
             observation[name] = np.array(value, dtype=np.float32)
     return observation

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +11,11 @@ from gymnasium.vector import AutoresetMode
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 
+if TYPE_CHECKING:
+    from outlap.viewer.live import LiveView
+
+RENDER_MODES = ("human", "rgb_array")
+
 
 class RaceEnv(gym.Env):
     """One race. Spaces, keywords and `info` are those of a world of `RaceVectorEnv`.
@@ -18,7 +23,20 @@ class RaceEnv(gym.Env):
     `lap_time_s` and `last_lap_time_s` come into `info` with the first completed lap.
     """
 
-    def __init__(self, **config: Any) -> None:
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012  # as Gymnasium has it
+
+    def __init__(self, *, render_mode: str | None = None, **config: Any) -> None:
+        """Build a race.
+
+        Args:
+            render_mode: "human" shows every step in a window, at the speed of the race; "rgb_array" makes `render`
+                draw. Both need the extra `viewer`.
+            **config: keywords of `RaceVectorEnv`.
+
+        Raises OutlapError as `RaceVectorEnv` does, and for another render mode.
+        """
+        if render_mode not in (None, *RENDER_MODES):
+            raise OutlapError(f"render_mode is {render_mode!r}; must be None, {' or '.join(RENDER_MODES)}")
         for name in ("num_envs", "autoreset_mode"):
             if name in config:
                 raise OutlapError(f"{name}: a single race has none; take gymnasium.make_vec or RaceVectorEnv")
@@ -26,8 +44,9 @@ class RaceEnv(gym.Env):
         self.config = self._env.config
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space
-        self.metadata = {"render_modes": [], "render_fps": self._env.metadata["render_fps"]}
-        self.render_mode = None
+        self.metadata = {**self.metadata, "render_fps": self._env.metadata["render_fps"]}
+        self.render_mode = render_mode
+        self._view: LiveView | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -35,12 +54,33 @@ class RaceEnv(gym.Env):
         """Begin an episode; a seed starts the stream of episodes anew."""
         super().reset(seed=seed)
         observation, info = self._env.reset(seed=seed)
+        self._show(begins=True)
         return _only(observation), _only(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Carry out an action (2,) in [-1, 1]: steering, speed."""
         observation, reward, terminated, truncated, info = self._env.step(np.asarray(action)[None])
+        self._show()
         return _only(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _only(info)
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The race from above: uint8 (720, 1280, 3) with render_mode "rgb_array"; a window shows itself."""
+        return self._view.pixels() if self._view is not None else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+    def _show(self, begins: bool = False) -> None:
+        if self.render_mode is None:
+            return
+        if self._view is None:
+            from outlap.viewer.live import LiveView  # pygame: not before it is needed
+
+            self._view = LiveView(self._env, window=self.render_mode == "human")
+        self._view.see(begins)
 
 
 def _only(batch: dict[str, Any]) -> dict[str, Any]:

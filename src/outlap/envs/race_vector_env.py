@@ -70,7 +70,7 @@ class RaceVectorEnv(VectorEnv):
             opponents: names (see `drivers.find`), `Driver`s or functions, one of which is drawn for each opponent at
                 each reset; by default pure pursuit.
             autoreset_mode: SAME_STEP, or DISABLED for a caller that resets by `reset_mask`.
-            render_mode: only None; races are looked at through `outlap`'s viewers.
+            render_mode: only None; `RaceEnv` draws.
             **config: the fields of `RaceConfig`.
 
         Raises OutlapError for an unknown or wrong field, a track or an opponent that cannot be loaded.
@@ -125,11 +125,13 @@ class RaceVectorEnv(VectorEnv):
         self._opponents = None
         if drivers:
             self._opponents = Opponents(drivers, self.race, self.config.opponent_speed, self.config.opponent_noise)
+        self.taken_over: dict[int, np.ndarray] = {}  # actions (2,) of cars that are driven in place of their drivers
         self._keys: np.ndarray | None = None
         self._episode = np.zeros(num_envs, np.int64)  # number of each world's episode since it was seeded
         self._over = np.ones(num_envs, bool)  # waits for a reset
         self._task = np.full(num_envs, "", object)  # name of each world's
         self._down = np.zeros((num_envs, self.config.num_cars - 1), bool)  # opponents that have crashed
+        self.wrecked = np.zeros_like(self._down)  # opponents that crashed in the last step
         self._names = np.array([track.name for track in loaded], dtype=object)
         self._totals = {name: np.zeros(num_envs) for name in (*EPISODE_FIELDS, *self._weights)}
 
@@ -226,6 +228,12 @@ class RaceVectorEnv(VectorEnv):
         self.race.rewards[:, car] = reward
         return reward
 
+    def rivals(self, world: int) -> list[str]:
+        """Names of the drivers of the other cars in a world, in their order."""
+        if self._opponents is None:
+            return [f"car {car}" for car in range(1, self.config.num_cars)]
+        return self._opponents.names()[world].tolist()
+
     def opponent_names(self) -> list[str]:
         """Of the drivers that opponents are drawn from."""
         return [] if self._opponents is None else [driver.name for driver in self._opponents.drivers]
@@ -310,6 +318,8 @@ class RaceVectorEnv(VectorEnv):
             if self._opponents is None:
                 raise OutlapError("opponents: none given; step drives the first car only, advance all of them")
             everyone[:, 1:] = self._opponents.act()
+        for car, action in self.taken_over.items():
+            everyone[:, car] = action
         return everyone
 
     def _find_opponents(self, names: Sequence[Named]) -> list[Driver]:
@@ -323,7 +333,8 @@ class RaceVectorEnv(VectorEnv):
         simulator, contact = self.race.simulator, self.race.worlds.contact
         wrecks = (contact == HIT_WALL) | (contact == HIT_CAR)
         wrecks[:, EGO] = False
-        self._totals["opponent_crashes"] += (wrecks[:, 1:] & ~self._down).sum(axis=1)
+        self.wrecked[:] = wrecks[:, 1:] & ~self._down
+        self._totals["opponent_crashes"] += self.wrecked.sum(axis=1)
         self._down[:] = contact[:, 1:] != FREE
         if self.config.opponent_crash != "park" and self._down.any():
             simulator.remove(wrecks)

@@ -275,6 +275,18 @@ def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[s
     return settings
 
 
+def single_race(driver: Driver, config: RaceConfig, track: Track) -> RaceVectorEnv:
+    """One world as `evaluate` has it for a driver, with the task's scanner even where nobody looks: for pictures.
+
+    Raises OutlapError for a task that the driver does not take.
+    """
+    settings = {**episode_settings(driver, config, track), "beams": config.beams}
+    env = RaceVectorEnv(1, **settings, autoreset_mode=AutoresetMode.DISABLED)
+    if isinstance(driver, PolicyDriver):
+        driver.check(env.single_observation_space)
+    return env
+
+
 def _without_reference(reward: RewardConfig) -> RewardConfig:
     return reward.model_copy(update={"weights": {**reward.weights, "velocity_matching": 0.0}})
 

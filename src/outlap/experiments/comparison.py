@@ -42,11 +42,8 @@ class Subject:
 
     @property
     def method(self) -> str:
-        """What its configuration says but for the seed; of one that was not trained, its name."""
-        if self.run is None:
-            return self.name
-        content = self.run.config.model_dump(mode="json")
-        return to_json({name: value for name, value in content.items() if name not in ("seed", "threads", "device")})
+        """What tells it from other methods; of one that was not trained, its name."""
+        return self.name if self.run is None else self.run.method
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,14 @@ from typing import Protocol
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from outlap.evaluation.statistics import performance_profile
+from outlap.evaluation.statistics import estimate_mean, performance_profile
 from outlap.experiments.results import METRICS, TableResult
-from outlap.viewer.plots import INK, WIDTH, new_figure
+from outlap.viewer.colours import COLOURS, INK
+from outlap.viewer.plots import WIDTH, finish, new_figure
 
-# Okabe and Ito's palette, in an order that keeps neighbours apart.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 RULES = {"none": "no clip", "fixed": "fixed clip", "abc": "ABC", "uniform": "β = 1"}
 RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uniform": COLOURS[7]}
 POINTS = 60  # of a learning curve
@@ -68,8 +66,7 @@ def draw_intervals(
         figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=7)
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    _tidy(*panels)
-    return figure
+    return finish(figure)
 
 
 def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str], title: str) -> Figure:
@@ -93,12 +90,11 @@ def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str], tit
         *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=7
     )
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    _tidy(*grid.ravel())
-    return figure
+    return finish(figure)
 
 
 def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> Figure:
-    """Return and crash rate of trainings over their steps: mean over seeds, with the range that seeds span.
+    """Return and crash rate of trainings over their steps: mean over seeds, with Student's 95 % interval.
 
     Args:
         curves: of every label, one table a seed with `step`, `episode_return` and `crash_rate`.
@@ -115,7 +111,9 @@ def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> F
             each = np.array([np.interp(steps, seed["step"].to_numpy(), seed[name].to_numpy()) for seed in seeds])
             axes.plot(steps / 1e6, each.mean(axis=0), color=colour, linewidth=1.2, label=label)
             if len(each) > 1:
-                axes.fill_between(steps / 1e6, each.min(axis=0), each.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+                bands = [estimate_mean(values) for values in each.T]
+                low, high = [band.low for band in bands], [band.high for band in bands]
+                axes.fill_between(steps / 1e6, low, high, color=colour, alpha=0.2, linewidth=0)
     returns.set_ylabel("return of recent episodes", fontsize=8)
     crashes.set(ylim=(0.0, 1.0))
     crashes.set_ylabel("share of them that crash", fontsize=8)
@@ -126,8 +124,7 @@ def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> F
             *returns.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=7
         )
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    _tidy(returns, crashes)
-    return figure
+    return finish(figure)
 
 
 def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame, title: str) -> Figure:
@@ -178,8 +175,7 @@ def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame, title: str) ->
         *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
     )
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    _tidy(*grid.ravel())
-    return figure
+    return finish(figure)
 
 
 def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame, title: str) -> Figure:
@@ -209,8 +205,7 @@ def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame, title: str) ->
     largest.set_xlabel("replay update (median over adaptations)", fontsize=8)
     largest.legend(fontsize=7, frameon=False)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    _tidy(spread, largest)
-    return figure
+    return finish(figure)
 
 
 def read_learning(folder: Path) -> pd.DataFrame:
@@ -228,9 +223,3 @@ def read_learning(folder: Path) -> pd.DataFrame:
 
 def _cycle(colours: Sequence[str]) -> list[str]:
     return list(colours) * 4
-
-
-def _tidy(*axes: Axes) -> None:
-    for each in axes:
-        each.spines[["top", "right"]].set_visible(False)
-        each.tick_params(which="both", labelsize=7)

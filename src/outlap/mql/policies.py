@@ -167,6 +167,12 @@ class MQLPolicy(BasePolicy):
         actions = self.unscale_action(chosen)
         return (actions[0] if single else actions), state
 
+    def context_of(self, memory: Memory) -> np.ndarray:
+        """The context z (n, hidden) that the last actions were chosen with."""
+        history = memory.history
+        with torch.no_grad():
+            return self.encode(history.windows(history.latest, self.history, self.window_terms)).cpu().numpy()
+
     def _new_history(self, n: int) -> HistoryBuffer:
         spaces = {name: box for name, box in self._spaces.items() if name in self.window_terms}
         return HistoryBuffer((self.history + 2) * n, gym.spaces.Dict(spaces), self._actions, n)

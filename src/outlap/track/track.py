@@ -101,6 +101,16 @@ class Track:
             raceline=racing,
         )
 
+    def coarse(self, block: int) -> np.ndarray:
+        """The walls in blocks of `block` × `block` pixels: bool, True where any of them is wall.
+
+        Row 0 and column 0 begin where the grid does; the last ones may reach beyond it.
+        """
+        rows, cols = self.occupancy.shape
+        padded = np.pad(self.occupancy, [(0, -rows % block), (0, -cols % block)])
+        blocks = padded.reshape(-(-rows // block), block, -(-cols // block), block)
+        return np.asarray(blocks.any(axis=(1, 3)))
+
     @cached_property
     def distance_field(self) -> np.ndarray:
         """How far a ray can go from anywhere in a cell: (height, width) float32 [m].

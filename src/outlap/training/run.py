@@ -43,6 +43,12 @@ class Run:
     config: TrainingConfig
 
     @property
+    def method(self) -> str:
+        """What its configuration says but for the seed and the machine: the same for all seeds of one method."""
+        content = self.config.model_dump(mode="json")
+        return to_json({name: value for name, value in content.items() if name not in ("seed", "threads", "device")})
+
+    @property
     def policy_path(self) -> Path:
         """The finished policy, or else the newest checkpoint. Raises OutlapError where there is neither."""
         for path in (self.folder / "policy.zip", *self.checkpoints()):

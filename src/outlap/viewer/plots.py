@@ -20,10 +20,8 @@ from outlap.errors import OutlapError
 from outlap.files import replacing
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
+from outlap.viewer.colours import BLUE, INK, VERMILLION, WALL_GREY
 
-# Okabe and Ito's palette: told apart with any colour vision, and by lightness in a grey print.
-BLUE, VERMILLION = "#0072B2", "#D55E00"
-WALL_GREY, INK = "#BDBDBD", "#222222"
 RACELINE_DASHES = (0, (4, 1.5))
 
 WIDTH = 7.0  # [inch] of the figure: the text width of a page
@@ -51,7 +49,7 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
         OutlapError: the ending of `path` names no format that Matplotlib writes.
     """
     centerline = track.centerline
-    low, high = _view(track)
+    low, high = view_of(track)
     map_height = min(8.0, max(2.5, (WIDTH - 0.8) * (high[1] - low[1]) / (high[0] - low[0])))
     figure = new_figure(WIDTH, map_height + 2.6)
     map_axes, curvature_axes = figure.subplots(2, 1, height_ratios=(map_height, 1.5))
@@ -59,9 +57,9 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
 
     direction = _direction(track)
     map_axes.set_title(
-        f"{track.name}: {centerline.length:.0f} m, {direction}", loc="left", fontsize=11, fontweight="bold"
+        f"{plain(track.name)}: {centerline.length:.0f} m, {direction}", loc="left", fontsize=11, fontweight="bold"
     )
-    _draw_walls(map_axes, track)
+    draw_walls(map_axes, track)
     _draw_line(map_axes, track)
     _draw_marks(map_axes, track, marks)
     _draw_start(figure, map_axes, track)
@@ -69,12 +67,7 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
     figure.legend(handles=_legend(track), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
 
     _draw_curvature(curvature_axes, track, marks)
-    for axes in (map_axes, curvature_axes):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
-    if path is not None:
-        save_figure(figure, path)
-    return figure
+    return finish(figure, path)
 
 
 def draw_raceline(
@@ -88,14 +81,14 @@ def draw_raceline(
         path: where to save the figure as well; the ending says in which format (png, pdf, svg).
         lap_time: for the title [s].
     """
-    low, high = _view(track)
+    low, high = view_of(track)
     map_height = min(8.0, max(2.5, (WIDTH - 1.4) * (high[1] - low[1]) / (high[0] - low[0])))
     figure = new_figure(WIDTH, map_height + 3.2)
     map_axes, speed_axes, grip_axes = figure.subplots(3, 1, height_ratios=(map_height, 1.2, 1.2))
     length = float(line.s[-1] + np.hypot(line.x[0] - line.x[-1], line.y[0] - line.y[-1]))
     lap = "" if lap_time is None else f", lap {lap_time:.2f} s"
-    map_axes.set_title(f"{track.name}: {length:.0f} m{lap}", loc="left", fontsize=11, fontweight="bold")
-    _draw_walls(map_axes, track)
+    map_axes.set_title(f"{plain(track.name)}: {length:.0f} m{lap}", loc="left", fontsize=11, fontweight="bold")
+    draw_walls(map_axes, track)
     x, y = np.append(line.x, line.x[0]), np.append(line.y, line.y[0])
     pieces = np.stack([np.column_stack([x[:-1], y[:-1]]), np.column_stack([x[1:], y[1:]])], axis=1)
     coloured = LineCollection(list(pieces), cmap="viridis", linewidth=1.6, capstyle="round")
@@ -112,9 +105,19 @@ def draw_raceline(
     grip_axes.axhline(0.0, color=INK, linewidth=0.6)
     grip_axes.set(xlabel="distance along the line [m]", ylabel="acceleration\n[m/s²]", xlim=(0.0, length))
     grip_axes.legend(loc="upper right", ncols=2, fontsize=7, frameon=False)
-    for axes in (map_axes, speed_axes, grip_axes):
+    return finish(figure, path)
+
+
+def plain(name: str) -> str:
+    """A name as Matplotlib shows it and nothing else: a $ begins no formula."""
+    return name.replace("$", r"\$")
+
+
+def finish(figure: Figure, path: str | os.PathLike[str] | None = None) -> Figure:
+    """Tidy the axes of a figure, and save it if there is a path."""
+    for axes in figure.axes:
         axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
+        axes.tick_params(which="both", labelsize=7)
     if path is not None:
         save_figure(figure, path)
     return figure
@@ -129,7 +132,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
         figure.savefig(partial, dpi=200)
 
 
-def _view(track: Track) -> tuple[np.ndarray, np.ndarray]:
+def view_of(track: Track) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of what is shown [m]: the track, not the empty rest of its map."""
     points = track.centerline.points
     half_width = max(track.centerline.width_left.max(), track.centerline.width_right.max())
@@ -148,14 +151,11 @@ def _direction(track: Track) -> str:
     return "anticlockwise" if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0 else "clockwise"
 
 
-def _draw_walls(axes: Axes, track: Track) -> None:
-    walls = track.occupancy
-    block = -(-max(walls.shape) // MAX_MAP_PIXELS)
-    # A block with any wall in it is drawn as wall, so that walls one pixel thick do not vanish.
-    rows, cols = (-(-side // block) for side in walls.shape)
-    padded = np.zeros((rows * block, cols * block), dtype=bool)
-    padded[: walls.shape[0], : walls.shape[1]] = walls
-    coarse = padded.reshape(rows, block, cols, block).any(axis=(1, 3))
+def draw_walls(axes: Axes, track: Track) -> None:
+    """The walls of a track, on axes in metres."""
+    block = -(-max(track.occupancy.shape) // MAX_MAP_PIXELS)
+    coarse = track.coarse(block)
+    rows, cols = coarse.shape
     image = np.zeros((rows, cols, 4), dtype=np.uint8)
     image[coarse] = (*bytes.fromhex(WALL_GREY[1:]), 255)
     size = block * track.resolution

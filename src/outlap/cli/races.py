@@ -1,0 +1,158 @@
+"""What a command races: drivers found by name, in the task that its flags ask for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from tyro.conf import FlagCreatePairsOff
+
+from outlap.cli.arguments import check_least
+from outlap.config import bounds
+from outlap.drivers.find import find_drivers
+from outlap.errors import OutlapError
+
+if TYPE_CHECKING:
+    from outlap.drivers.driver import Driver
+    from outlap.envs.race_config import RaceConfig
+    from outlap.training.run import Run
+
+Flag = FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaceFlags:
+    """Flags of commands that race a driver."""
+
+    task: str | None = None
+    """A run folder: race as in its training, its cars with their ranges, on its held-out tracks; of a driver that has a
+    scanner and a top speed of its own, those stay. By default the driver's own task."""
+
+    v_max: float | None = None
+    """[m/s] top speed of the cars, in place of the run's; what the policy commands stays within what it learnt."""
+
+    num_cars: int | None = None
+    """The driver's car and opponents; by default as many as the run was trained with."""
+
+    opponents: tuple[str, ...] = ()
+    """Drivers and populations to draw opponents from, in place of the run's; one where the run had none."""
+
+    opponent_code: Flag = False
+    """Load opponents that can run code when they are loaded: run folders, module:function."""
+
+    opponent_split: Literal["train", "held_out"] = "held_out"
+    """The half of a population that opponents are drawn from."""
+
+    racing_line: Literal["track", "min-curvature", "min-time"] | None = None
+    """That pure pursuit follows, in place of the run's: the track's own, or one planned for the car."""
+
+    formation: Literal["queue", "behind", "grid", "scattered"] | None = None
+    """In which the cars start, in place of the run's; behind: the driver's car is the last."""
+
+    seed: int = 0
+    """Of the episodes."""
+
+    def check_races(self) -> None:
+        """Raises OutlapError for a flag that is out of its range."""
+        check_least("--seed", self.seed, 0)
+        check_least("--num-cars", 1 if self.num_cars is None else self.num_cars, 1)
+        check_positive("--v-max", self.v_max)
+
+    def subject(self, name: str, *, deterministic: bool = True) -> Subject:
+        """A driver, and what it is to race in. Raises what `find_subject` does."""
+        from outlap.evaluation.rollout import made_for
+        from outlap.training.run import load_run
+
+        driver, env, run = find_subject(name, deterministic=deterministic, seed=self.seed)
+        task = run
+        if self.task is not None:
+            task = load_run(self.task)
+            env = made_for(driver, task.config.env)
+        env = self._as_asked(with_top_speed(env, self.v_max))
+        if self.racing_line and env.num_cars == 1 and "line_ahead" not in driver.observation_terms:
+            raise OutlapError(f"--racing-line is {self.racing_line}; {driver.name} follows no line")
+        return Subject(driver, env, run, task)
+
+    def _as_asked(self, env: RaceConfig) -> RaceConfig:
+        changes: dict[str, Any] = {"opponent_split": self.opponent_split}
+        if self.num_cars is not None:
+            changes["num_cars"] = self.num_cars
+        if self.opponents:
+            changes |= {"num_cars": max(2, env.num_cars), **changes, "opponents": self.opponents}
+        if self.opponent_code:
+            changes["opponent_code"] = True
+        if self.racing_line is not None:
+            changes["racing_line"] = self.racing_line
+        if self.formation:
+            changes["start"] = env.start.model_copy(update={"formation": self.formation})
+        return env.model_copy(update=changes)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A driver, and what it races in."""
+
+    driver: Driver
+    env: RaceConfig
+    run: Run | None  # the driver's, if it was trained
+    task: Run | None  # that the environment is of
+
+
+def check_positive(flag: str, value: float | None) -> None:
+    """Raises OutlapError for a number that is given, and not above 0 and finite."""
+    if value is not None and not 0.0 < value < float("inf"):
+        raise OutlapError(f"{flag} is {value}; must be > 0")
+
+
+def is_run(name: str) -> bool:
+    """Whether a driver's name is that of a run folder."""
+    return (Path(name) / "config.yaml").is_file()
+
+
+def find_subject(name: str, *, deterministic: bool = True, seed: int = 0) -> tuple[Driver, RaceConfig, Run | None]:
+    """The one driver that a name stands for, the environment that it is made for, and its run if it has one.
+
+    Args:
+        name: a run folder, or what `drivers.find` knows.
+        deterministic, seed: see `PolicyDriver`; of a run's policy.
+
+    Raises OutlapError for a name that stands for nobody, or for many.
+    """
+    from outlap.evaluation.rollout import made_for
+    from outlap.training.ppo import PPOConfig
+    from outlap.training.run import load_run
+
+    if is_run(name):
+        run = load_run(name)
+        return run.driver(deterministic=deterministic, seed=seed), run.config.env, run
+    env = PPOConfig().env
+    drivers = find_drivers([name], env.field_of_view, split=None, run_code=True)
+    if len(drivers) > 1:
+        names = ", ".join(driver.name for driver in drivers)
+        raise OutlapError(f"{name}: is a population; name one of its drivers, {name}/NAME: {names}")
+    return drivers[0], made_for(drivers[0], env), None
+
+
+def held_out_tracks(run: Run | None) -> tuple[str, ...]:
+    """Names of the tracks that a run has kept from its training, or else the built-in ones."""
+    from outlap.track.generate import BUILTIN_HELD_OUT
+
+    return (run.config.held_out_tracks if run else ()) or BUILTIN_HELD_OUT
+
+
+def with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
+    """The task with another top speed of the cars; actions go on to mean the speeds that they were trained with."""
+    if v_max is None:
+        return env
+    vehicle = env.vehicle.model_copy(update={"v_max": v_max})
+    speeds = env.speed_range or (bounds(env.vehicle.v_min)[0], None)
+    if speeds[1] is None:
+        speeds = (speeds[0], bounds(env.vehicle.v_max)[1])
+    return env.model_copy(update={"vehicle": vehicle, "speed_range": speeds})
+
+
+def unused(folder: Path) -> Path:
+    """This folder, or one numbered like it where two evaluations begin in the same second."""
+    numbered = (folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))
+    return next(path for path in (folder, *numbered) if not path.exists())
