@@ -76,3 +76,9 @@ def test_a_run_of_another_algorithm_is_named() -> None:
     path.write_text(path.read_text().replace("algorithm: mql", "algorithm: dqn"))
     with pytest.raises(OutlapError, match=r"algorithm is 'dqn'; must be one of ppo, recurrent-ppo, mql"):
         load_run("run")
+
+
+def test_rewards_are_observed_whatever_else_is() -> None:
+    """Else they would be told as they are in training, and divided by their scale in races."""
+    assert MQLConfig(env=RaceConfig(observation=("scan", "vel"))).env.observation == ("scan", "vel", "previous_reward")
+    assert MQLConfig().env.observation.count("previous_reward") == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
@@ -42,6 +42,14 @@ class MQLConfig(TrainingConfig):
     policy_noise: float = Field(default=0.2, ge=0)
     noise_clip: float = Field(default=0.5, ge=0)
     policy_delay: int = Field(default=2, ge=1)
+
+    @field_validator("env")
+    @classmethod
+    def _told_its_rewards(cls, env: RaceConfig) -> RaceConfig:
+        """MQL sees them in any case: as an observation of the environment they are scaled in training as in a race."""
+        if "previous_reward" in env.observation:
+            return env
+        return env.model_copy(update={"observation": (*env.observation, "previous_reward")})
 
     @property
     def report_every(self) -> int:
