@@ -5,8 +5,6 @@ from __future__ import annotations
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
-
 if TYPE_CHECKING:
     from outlap.errors import OutlapError
     from outlap.simulator.simulator import Simulator
@@ -15,12 +13,17 @@ if TYPE_CHECKING:
 __all__ = ["OutlapError", "Simulator", "Track"]
 __version__ = version("outlap")
 
-if "outlap/Race-v0" not in gymnasium.registry:
-    gymnasium.register(
-        "outlap/Race-v0",
-        entry_point="outlap.envs.race_env:RaceEnv",
-        vector_entry_point="outlap.envs.race_vector_env:RaceVectorEnv",
-    )
+try:
+    import gymnasium
+except ModuleNotFoundError:  # on a car there are NumPy and onnxruntime, for `outlap.deploy`
+    pass
+else:
+    if "outlap/Race-v0" not in gymnasium.registry:
+        gymnasium.register(
+            "outlap/Race-v0",
+            entry_point="outlap.envs.race_env:RaceEnv",
+            vector_entry_point="outlap.envs.race_vector_env:RaceVectorEnv",
+        )
 
 _HOMES = {
     "OutlapError": "outlap.errors",
