@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -126,6 +127,19 @@ def test_interrupt_is_130_and_a_bug_keeps_its_traceback(capsys: pytest.CaptureFi
     assert capsys.readouterr().err == "outlap test lap: interrupted\n"
     with pytest.raises(ZeroDivisionError):
         cli.main(["test", "lap", "--fail", "bug"])
+
+
+@pytest.mark.parametrize("fault", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_storage_that_fails_is_one_line_and_no_bug(
+    fault: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(self: Lap) -> None:
+        raise OSError(fault, os.strerror(fault), "runs/mine/policy.zip")
+
+    monkeypatch.setattr(Lap, "run", run)
+    assert cli.main(["test", "lap"]) == 2
+    err = capsys.readouterr().err
+    assert err == f"outlap test lap: error: runs/mine/policy.zip: cannot be written: {os.strerror(fault)}\n"
 
 
 def test_json_on_standard_output_stands_alone(capfd: pytest.CaptureFixture[str]) -> None:

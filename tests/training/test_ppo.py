@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_a_stopped_run_goes_on_where_it_was() -> None:
     assert model._total_timesteps == 512
 
 
-def test_a_broken_checkpoint_gives_way_to_the_one_before() -> None:
+def test_a_broken_checkpoint_gives_way_to_the_one_before(caplog: pytest.LogCaptureFixture) -> None:
     stopped_after(384, SMALL, Path("run"))
     run = load_run("run")
     newest = run.checkpoints()[0]
@@ -86,6 +87,50 @@ def test_a_broken_checkpoint_gives_way_to_the_one_before() -> None:
     train(run.config, run.folder, resume=run, on_progress=reports.append)
     assert reports[0].steps == 384
     assert newest.name in json.dumps(json.loads((run.folder / "run.json").read_text()))
+    assert f"{newest}: cannot be read, and is left out" in caplog.text
+
+
+def test_a_network_that_diverges_ends_the_training_and_spares_what_was_saved() -> None:
+    stopped_after(256, SMALL, Path("run"))
+    run = load_run("run")
+    kept = run.checkpoints()
+    said = f"diverged: .* is NaN or beyond 1e\\+08 after .* checkpoint is {kept[0]}; train anew"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stable_baselines3.ppo.PPO.load", _loaded_with(1e30))
+        with pytest.raises(OutlapError, match=said):
+            train(run.config, run.folder, resume=run)
+    assert run.checkpoints() == kept
+    assert not (run.folder / "policy.zip").exists()
+    assert train(run.config, run.folder, resume=load_run("run")).finished
+
+
+def _loaded_with(rate: float):
+    """PPO.load, with another learning rate than the checkpoint's."""
+    load = PPO.load
+
+    def loaded(*args, **settings):
+        model = load(*args, **settings)
+        model.learning_rate = rate
+        model._setup_lr_schedule()
+        return model
+
+    return loaded
+
+
+def test_a_full_disk_is_an_error_of_storage_and_what_was_saved_stays() -> None:
+    stopped_after(256, SMALL, Path("run"))
+    run = load_run("run")
+    kept = {path: path.read_bytes() for path in run.checkpoints()}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, hard))  # no file grows beyond: as on a full disk
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            train(run.config, run.folder, resume=run)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert {path: path.read_bytes() for path in run.checkpoints()} == kept
+    assert not list(run.folder.rglob("*.partial*"))
+    assert train(run.config, run.folder, resume=load_run("run")).finished
 
 
 def test_a_finished_run_is_not_trained_further() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import importlib
 import logging
 import os
@@ -25,6 +26,8 @@ from outlap.cli.output import (
 from outlap.errors import OutlapError
 
 SHOWN = "outlap-cli"  # name of the handler that shows what is logged
+# A full disk, a quota, a file system or a folder that cannot be written: no bugs.
+STORAGE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 DONE, BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED = 0, 2, 130, 141
 
 
@@ -115,6 +118,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         # `| head` has seen enough; nor may the interpreter complain when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OUTPUT_CLOSED
+    except OSError as error:
+        if error.errno not in STORAGE_FAULTS:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"{prog}: error: {where}cannot be written: {error.strerror}", file=sys.stderr)
+        return BAD_INPUT
 
 
 def _show_log(quiet: bool) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, brief
 
 METADATA = "outlap"  # key of what an exported file says about itself
 FORMAT = 1
@@ -72,8 +72,7 @@ class CarDriver:
             self.steering: tuple[float, float] = tuple(map(float, facts["steering"]))  # type: ignore[assignment]
             self.reward: dict[str, float] = {name: float(weight) for name, weight in facts["reward"].items()}
         except Exception as error:  # whatever a broken file raises
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise OutlapError(f"{path}: is no policy of outlap export: {reason}") from None
+            raise OutlapError(f"{path}: is no policy of outlap export: {brief(error)}") from None
         self.limits = limits or Limits()
         self._angles = np.linspace(-0.5, 0.5, self.beams) * self.field_of_view
         (size,) = next(each.shape for each in self._session.get_inputs() if each.name == STATE)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from outlap.drivers.vehicle_actions import WHEELBASE, speed_action
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, brief
 from outlap.files import atomic_write
 
 COLUMNS = ("t_s", "x_m", "y_m", "yaw_rad", "vx_mps")
@@ -104,7 +104,7 @@ class Ghost:
                 raise ValueError(f"its first line is {header[:60]!r}; must be {','.join(COLUMNS)!r}")
             lap = np.array([[float(value) for value in row.split(",")] for row in rows if row.strip()])
         except (OSError, ValueError) as error:
-            raise OutlapError(f"{path}: cannot be read as a recorded lap: {error}") from None
+            raise OutlapError(f"{path}: cannot be read as a recorded lap: {brief(error)}") from None
         return cls(lap, name=Path(path).stem)
 
 

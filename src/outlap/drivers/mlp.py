@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, brief
 from outlap.files import atomic_write, to_json
 
 if TYPE_CHECKING:
@@ -123,8 +123,8 @@ class MLPDriver:
                 tuple(tensors[f"weight_{i}"].astype(np.float32) for i in layers),
                 tuple(tensors[f"bias_{i}"].astype(np.float32) for i in layers),
             )
-        except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, SafetensorError) as error:
-            raise OutlapError(f"{path}: cannot be read as a driver: {error}") from None
+        except (OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, SafetensorError) as error:
+            raise OutlapError(f"{path}: cannot be read as a driver: {brief(error)}") from None
         driver._check(path)
         return driver
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, brief
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -100,8 +100,7 @@ class PolicyDriver:
         try:
             model = algorithm.load(Path(path), device="cpu")
         except Exception as error:  # whatever a broken archive or pickle raises
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise OutlapError(f"{path}: cannot be loaded as a {algorithm.__name__} model: {reason}") from error
+            raise OutlapError(f"{path}: cannot be loaded as a {algorithm.__name__} model: {brief(error)}") from error
         return cls(
             model,
             scale_observations=scale_observations,

@@ -21,7 +21,7 @@ from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.terminations import CRASH
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, brief
 from outlap.evaluation.rollout import CURRICULA_OVER, episode_settings, single_race, standing_starts
 from outlap.files import atomic_write
 from outlap.simulator import state as column
@@ -117,7 +117,7 @@ class Recording:
         except OutlapError:
             raise
         except Exception as error:  # whatever a broken archive raises
-            raise OutlapError(f"{path}: is no recording: {' '.join(str(error).split())}") from None
+            raise OutlapError(f"{path}: is no recording: {brief(error)}") from None
         frames, cars = len(arrays["time"]), len(info.cast.drivers)
         shapes = {
             "time": (frames,), "motion": (frames, cars, len(MOTION)), "distance": (frames, cars),

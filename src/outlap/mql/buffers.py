@@ -20,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, brief
 from outlap.files import replacing
 
 NONE = -1  # serial of no row
@@ -374,7 +374,7 @@ class HistoryBuffer:
                 )
                 buffer._departures.append(recent)
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise OutlapError(f"{path}: cannot be read as a replay: {error}") from None
+            raise OutlapError(f"{path}: cannot be read as a replay: {brief(error)}") from None
         return buffer
 
 

@@ -24,6 +24,7 @@ X, Y, TANGENT_X, TANGENT_Y, CURVATURE, WIDTH_RIGHT, WIDTH_LEFT = range(7)
 TABLE_COLUMNS = 7
 
 MIN_POINTS = 4
+LONGEST = 1e5  # [m] of a lap, and of a coordinate
 
 # A point nearer to its predecessor than this part of the median spacing is the same point twice.
 _SAME_POINT = 1e-3
@@ -61,7 +62,7 @@ class Centerline:
 
         A last point that repeats the first is dropped, and so is any that repeats its predecessor.
         `width_right`, `width_left`: (n,) or scalar [m]. Raises OutlapError for fewer than four
-        distinct points, for NaN or infinite values and for negative widths.
+        distinct points, for NaN or infinite values, for negative widths and for more than 100 km.
         """
         points = np.array(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2:
@@ -76,6 +77,12 @@ class Centerline:
         if len(points) < MIN_POINTS:
             raise OutlapError(
                 f"centreline: has {len(points)} distinct points; a closed line needs at least {MIN_POINTS}"
+            )
+        around = float(np.hypot(*(points - np.roll(points, 1, axis=0)).T).sum())
+        if around > LONGEST or np.abs(points).max() > LONGEST:
+            raise OutlapError(
+                f"centreline: is {around:g} m long, and up to {np.abs(points).max():g} m from the origin; must be at "
+                f"most {LONGEST:g} m: are its units metres?"
             )
         curve, chord, s, length = _fit_drivable(points)
         for array in (s, points, right, left):

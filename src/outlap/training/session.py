@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from abc import abstractmethod
 from collections import deque
@@ -18,6 +19,7 @@ from outlap.config import Config
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
 from outlap.envs.terminations import CRASH
+from outlap.errors import OutlapError
 from outlap.training.run import Run, create_run, save_checkpoint
 
 if TYPE_CHECKING:
@@ -25,6 +27,9 @@ if TYPE_CHECKING:
 
     from outlap.envs.sb3_vec_env import SB3VecEnv
 
+log = logging.getLogger(__name__)
+
+LARGEST_WEIGHT = 1e8  # of a network that has not diverged
 RECENT_EPISODES = 500  # over which training statistics are taken
 
 
@@ -113,8 +118,8 @@ def train(
         resume: a run to continue from its newest checkpoint; one that is finished is handed back.
         on_progress: called at the end of a rollout, see `TrainingConfig.report_every`.
 
-    Raises OutlapError for a track that cannot be loaded, a folder that holds a run. A KeyboardInterrupt
-    passes through once a checkpoint is written.
+    Raises OutlapError for a track that cannot be loaded, a folder that holds a run, a network that diverges. A
+    KeyboardInterrupt passes through once a checkpoint is written.
     """
     if resume is not None and resume.finished:
         return resume
@@ -153,6 +158,10 @@ def train(
     except KeyboardInterrupt:
         _save(run, model, clock)
         raise
+    except Exception:
+        _check_finite(model, run)  # a network that has diverged breaks other things first
+        raise
+    _check_finite(model, run)
     _save_replay(run, model)
     save_checkpoint(run, model, "policy.zip")
     run.note_pace(
@@ -183,12 +192,28 @@ def _newest_model(run: Run, environment, config: TrainingConfig):
         try:
             model = config.model_class().load(path, env=environment, device=config.device)
         except Exception as error:  # whatever a broken file raises: the one before may be whole
+            log.warning("%s: cannot be read, and is left out; the one before is taken", path)
             run.write_record(**{f"unreadable_{path.name}": str(error)})
             continue
         if run.replay_path.exists():
-            model.load_replay_buffer(run.replay_path)  # type: ignore[attr-defined]
+            try:
+                model.load_replay_buffer(run.replay_path)  # type: ignore[attr-defined]
+            except OutlapError as error:
+                log.warning("%s; the training goes on with an empty one", error)
         return model
     return None
+
+
+def _check_finite(model: Any, run: Run) -> None:
+    """Raises OutlapError for a network that has diverged, before it drives or is saved."""
+    for name, parameter in model.policy.named_parameters():
+        if not (parameter.abs() < LARGEST_WEIGHT).all():  # nor is NaN
+            kept = run.checkpoints()
+            last = f"the last good checkpoint is {kept[0]}" if kept else "there is no checkpoint yet"
+            raise OutlapError(
+                f"{run.folder}: the training diverged: {name} is NaN or beyond {LARGEST_WEIGHT:g} after "
+                f"{model.num_timesteps:,} steps; {last}; train anew with a lower --learning-rate"
+            )
 
 
 def _watcher(run: Run, config: TrainingConfig, clock: Stopwatch, on_progress: Callable[[Progress], None] | None):
@@ -208,6 +233,7 @@ def _watcher(run: Run, config: TrainingConfig, clock: Stopwatch, on_progress: Ca
 
         def _on_rollout_start(self) -> None:
             # Here, and not where a rollout ends: by now the policy has learnt from all that it has seen.
+            _check_finite(self.model, run)
             if self.model.num_timesteps - self.saved_at >= config.checkpoint_every:
                 _save(run, self.model, clock)
                 self.saved_at = self.model.num_timesteps
