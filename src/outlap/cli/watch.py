@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,6 +11,8 @@ from tyro.conf import Positional, arg
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.cli.races import RaceFlags, check_positive, held_out_tracks
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +52,7 @@ class WatchRaces(RaceFlags):
         found = self.subject(self.driver)
         track = Track.load(self.track or held_out_tracks(found.task)[0])
         env = standing_starts(found.env, [track], self.laps, self.time_limit)
+        log.info("preparing %s on %s; h in the window lists the keys", found.driver.name, track.name)
         watch = Watch(found.driver, env, track, self.seed, self.size)
         watch.run()
         data = {"driver": found.driver.name, "track": track.name, "episodes": watch.episode}
