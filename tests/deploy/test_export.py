@@ -54,7 +54,7 @@ def run_of(config: type[TrainingConfig], folder: Path, track: str, env: dict[str
         (PPOConfig, ENV, PPO),
         (RecurrentPPOConfig, {**ENV, "scale_observations": True}, {**PPO, "lstm_hidden": 8}),
         (MQLConfig, META, {**SMALL, "preset": "fast"}),
-        (MQLConfig, META, {**SMALL, "preset": "paper"}),
+        (MQLConfig, META, {**SMALL, "preset": "paper", "history": 4}),
         (MQLConfig, ENV, {**SMALL, "preset": "fast", "uses_context": False, "uses_reward": False}),
     ],
     ids=["ppo", "recurrent-ppo", "mql-fast", "mql-paper", "td3"],

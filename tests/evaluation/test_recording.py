@@ -62,7 +62,8 @@ def places(recording: Recording, kind: str) -> int:
 
 @pytest.mark.parametrize("fate", ["park", "remove", "respawn"])
 def test_a_rivals_crash_is_an_event(fate: str):
-    task = TASK.model_copy(
+    brief = standing_starts(RACE, [TRACK], laps=0, time_limit=6.0)
+    task = brief.model_copy(
         update={"opponents": ("recordings:straight_on",), "opponent_code": True, "opponent_crash": fate, "num_cars": 2}
     )
     row = evaluate(DRIVER, task, [TRACK], 1, seed=0, lap_time_ratios=False).iloc[0]
