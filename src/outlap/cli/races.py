@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import FlagCreatePairsOff
 
 from outlap.cli.arguments import check_least
-from outlap.config import bounds
 from outlap.drivers.find import find_drivers
 from outlap.errors import OutlapError
 
@@ -146,10 +145,7 @@ def with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
     if v_max is None:
         return env
     vehicle = env.vehicle.model_copy(update={"v_max": v_max})
-    speeds = env.speed_range or (bounds(env.vehicle.v_min)[0], None)
-    if speeds[1] is None:
-        speeds = (speeds[0], bounds(env.vehicle.v_max)[1])
-    return env.model_copy(update={"vehicle": vehicle, "speed_range": speeds})
+    return env.model_copy(update={"vehicle": vehicle, "speed_range": env.commanded_speeds})
 
 
 def unused(folder: Path) -> Path:

@@ -13,16 +13,12 @@ from outlap.envs.race import EGO
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.simulator import state as column
 from outlap.simulator.collision import REMOVED
+from outlap.simulator.lidar import beam_angles
 from outlap.simulator.vehicle import LENGTH, MAX_RANGE, MOUNT_X, MU, WIDTH
 
 MOTION = (column.X, column.Y, column.YAW, column.SPEED, column.STEER, column.SLIP)  # columns of `Frame.motion`
 X, Y, YAW, SPEED, STEER, SLIP = range(len(MOTION))
 NO_ECHO = 0.99  # of the largest range: noise aside, a beam that is longer hit nothing
-
-
-def beam_angles(count: int, field_of_view: float) -> np.ndarray:
-    """Of a scan's beams to the car's x axis, right to left: (count,) [rad]; one beam looks ahead."""
-    return np.linspace(-0.5, 0.5, count) * field_of_view if count != 1 else np.zeros(1)
 
 
 def _printable(text: str) -> str:

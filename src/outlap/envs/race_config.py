@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from outlap.config import Number, bounded
+from outlap.config import Number, bounded, bounds
 from outlap.envs.racing_line import RacingLine
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.starts import StartConfig
@@ -78,3 +78,9 @@ class RaceConfig(SimulatorConfig):
         if speeds is not None and speeds[1] is not None and not speeds[0] < speeds[1]:
             raise ValueError("must be (slowest, fastest) [m/s] with slowest < fastest")
         return speeds
+
+    @property
+    def commanded_speeds(self) -> tuple[float, float]:
+        """[m/s] that the actions -1 and 1 command; of cars that are drawn, those of the fastest either way."""
+        slowest, fastest = self.speed_range or (bounds(self.vehicle.v_min)[0], None)
+        return slowest, bounds(self.vehicle.v_max)[1] if fastest is None else fastest

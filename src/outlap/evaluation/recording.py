@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -193,7 +193,7 @@ def record_episode(
         if on_progress is not None:
             on_progress(float(race.race.worlds.time[0]))
     outcome = str(info["outcome"][0])
-    watcher.note(EGO, "end", _end(outcome, info))
+    watcher.note(EGO, "end", how_it_ended(info))
     words = RecordingInfo(
         title=title or driver.name,
         track=track.name,
@@ -264,10 +264,11 @@ def _places(count: int) -> str:
     return "a place" if count == 1 else f"{count} places"
 
 
-def _end(outcome: str, info: dict[str, Any]) -> str:
-    """How an episode ended, in words."""
+def how_it_ended(info: Mapping[str, Any]) -> str:
+    """How an episode of the only world ended, in words, from what its last step told."""
+    outcome = str(info["outcome"][0])
     if outcome == CRASH:
-        return f"crash into a {info['contact'][0]} at {info['impact_speed_mps'][0]:.1f} m/s"
+        return f"{outcome} into a {info['contact'][0]} at {info['impact_speed_mps'][0]:.1f} m/s"
     return outcome
 
 

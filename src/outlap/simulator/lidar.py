@@ -46,14 +46,21 @@ _normal = np.array([NormalDist().inv_cdf(p) for p in _probability])
 NORMAL = (_normal / _normal.std()).astype(np.float32)  # equally likely values of a standard normal
 
 
-def beam_directions(beams: int, field_of_view: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cosine and sine of each beam's angle to the car's x axis, right to left: float32 (beams,) each.
+def beam_angles(beams: int, field_of_view: float) -> np.ndarray:
+    """Of a scan's beams to the car's x axis, right to left: (beams,) [rad].
 
-    The outermost beams lie at ± `field_of_view` / 2 [rad]; one beam looks ahead. Both arrays are longer
-    than `beams`: the last direction is repeated to fill whole groups of `LANES`.
+    The outermost ones lie at ± `field_of_view` / 2; one beam looks ahead.
     """
     half = 0.5 * field_of_view
-    angles = np.linspace(-half, half, beams) if beams != 1 else np.zeros(1)
+    return np.linspace(-half, half, beams) if beams != 1 else np.zeros(1)
+
+
+def beam_directions(beams: int, field_of_view: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cosine and sine of the `beam_angles`: float32 (beams,) each.
+
+    Both arrays are longer than `beams`: the last direction is repeated to fill whole groups of `LANES`.
+    """
+    angles = beam_angles(beams, field_of_view)
     angles = np.pad(angles, (0, -beams % LANES), mode="edge") if beams else angles
     return np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
 

@@ -23,7 +23,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from outlap.config import bounds, read_yaml, save_config, validate
+from outlap.config import read_yaml, save_config, validate
 from outlap.errors import OutlapError
 from outlap.files import atomic_write, replacing, to_json
 
@@ -67,7 +67,6 @@ class Run:
         from outlap.drivers.policy import PolicyDriver
 
         env = self.config.env
-        slowest, fastest = env.speed_range or (bounds(env.vehicle.v_min)[0], None)
         return PolicyDriver.load(
             self.policy_path,
             algorithm=self.config.model_class(),
@@ -75,7 +74,7 @@ class Run:
             deterministic=deterministic,
             seed=seed,
             name=self.folder.resolve().name,
-            speeds=(slowest, bounds(env.vehicle.v_max)[1] if fastest is None else fastest),
+            speeds=env.commanded_speeds,
             reward=env.reward,
         )
 

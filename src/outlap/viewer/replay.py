@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from outlap.envs.frame import NO_ECHO, YAW, beam_angles
+from outlap.envs.frame import NO_ECHO, YAW
 from outlap.evaluation.recording import Recording, check_together
 from outlap.files import atomic_write
+from outlap.simulator.lidar import beam_angles
 from outlap.track.track import Track
 from outlap.viewer.colours import COLOURS, WALL_GREY
 

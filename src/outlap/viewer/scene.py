@@ -160,7 +160,7 @@ class Scene:
         for entry, colour in coloured:
             if self.shown.trails:
                 trail = np.vstack([entry.trail[-LONGEST_TRAIL:], entry.frame.motion[EGO, [X, Y]]])
-                self._polyline(self._upright(trail), _mixed(colour, 0.5), width=TRAIL_WIDTH)
+                self._polyline(self._upright(trail), mixed_with_white(colour, 0.5), width=TRAIL_WIDTH)
             if self.shown.lidar:
                 self._draw_scan(entry, colour)
         for entry, colour in coloured:
@@ -362,7 +362,7 @@ def bytes_of(colour: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _mixed(colour: str, share: float) -> tuple[int, ...]:
+def mixed_with_white(colour: str, share: float) -> tuple[int, ...]:
     """A colour with a share of white."""
     return tuple(round(value + (255 - value) * share) for value in bytes_of(colour))
 

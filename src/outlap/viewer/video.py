@@ -15,7 +15,7 @@ from outlap.evaluation.recording import Recording, check_together
 from outlap.files import replacing
 from outlap.track.track import Track
 from outlap.viewer.colours import COLOURS
-from outlap.viewer.scene import CRASH_RED, RACELINE, Entry, Scene, bytes_of
+from outlap.viewer.scene import CRASH_RED, RACELINE, Entry, Scene, mixed_with_white
 
 View = Literal["follow", "track"]
 ENDINGS = (".mp4", ".gif")
@@ -55,12 +55,10 @@ def write_video(
     check_video(path, size, frames_per_second)
     check_together(recordings, track, len(COLOURS))
     count = count_pictures(recordings, frames_per_second, speed)
-    pictures = _pictures(recordings, Scene(track, size), count, speed / frames_per_second, view)
+    pictures = _pictures(recordings, Scene(track, size), count, speed / frames_per_second, view, on_progress)
+    write = _write_mp4 if path.suffix.lower() == ".mp4" else _write_gif
     with replacing(path) as partial:
-        if path.suffix.lower() == ".mp4":
-            _write_mp4(pictures, partial, size, frames_per_second, on_progress)
-        else:
-            _write_gif(pictures, partial, size, frames_per_second, on_progress)
+        write(pictures, partial, size, frames_per_second)
     return path
 
 
@@ -86,7 +84,7 @@ def write_picture(
     scene = Scene(track, size)
     _draw(recordings, scene, moment, view)
     with replacing(path) as partial:
-        Image.frombuffer("RGB", size, scene.buffer(), "raw", "BGRX", 0, 1).save(partial, format="png", optimize=True)
+        _image(scene.buffer(), size).save(partial, format="png", optimize=True)
     return Path(path)
 
 
@@ -109,11 +107,24 @@ def check_video(path: Path, size: tuple[int, int], frames_per_second: int) -> No
         )
 
 
-def _pictures(recordings: Sequence[Recording], scene: Scene, count: int, step: float, view: View) -> Iterator[bytes]:
-    """Every picture, see `Scene.buffer`."""
+def _pictures(
+    recordings: Sequence[Recording],
+    scene: Scene,
+    count: int,
+    step: float,
+    view: View,
+    on_progress: Callable[[int], None] | None,
+) -> Iterator[bytes]:
+    """Every picture, see `Scene.buffer`; each is done when the next one is asked for."""
     for number in range(count):
         _draw(recordings, scene, number * step, view)
         yield scene.buffer()
+        if on_progress is not None:
+            on_progress(number + 1)
+
+
+def _image(picture: bytes, size: tuple[int, int]) -> Image.Image:
+    return Image.frombuffer("RGB", size, picture, "raw", "BGRX", 0, 1)
 
 
 def _draw(recordings: Sequence[Recording], scene: Scene, time: float, view: View) -> None:
@@ -129,13 +140,7 @@ def _draw(recordings: Sequence[Recording], scene: Scene, time: float, view: View
     scene.draw(entries, "   ".join(f"{info.title}: {info.outcome}" for info in over))
 
 
-def _write_mp4(
-    pictures: Iterator[bytes],
-    path: Path,
-    size: tuple[int, int],
-    frames_per_second: int,
-    on_progress: Callable[[int], None] | None,
-) -> None:
+def _write_mp4(pictures: Iterator[bytes], path: Path, size: tuple[int, int], frames_per_second: int) -> None:
     try:
         from imageio_ffmpeg import write_frames
     except ImportError as error:
@@ -147,30 +152,19 @@ def _write_mp4(
     )  # fmt: skip
     writer.send(None)
     try:
-        for number, picture in enumerate(pictures, start=1):
+        for picture in pictures:
             writer.send(picture)
-            if on_progress is not None:
-                on_progress(number)
     finally:
         writer.close()
 
 
-def _write_gif(
-    pictures: Iterator[bytes],
-    path: Path,
-    size: tuple[int, int],
-    frames_per_second: int,
-    on_progress: Callable[[int], None] | None,
-) -> None:
+def _write_gif(pictures: Iterator[bytes], path: Path, size: tuple[int, int], frames_per_second: int) -> None:
     palette = _palette()
     images: list[Image.Image] = []
     for number, picture in enumerate(pictures, start=1):
-        image = Image.frombuffer("RGB", size, picture, "raw", "BGRX", 0, 1)
-        images.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
+        images.append(_image(picture, size).quantize(palette=palette, dither=Image.Dither.NONE))
         if number * size[0] * size[1] > LARGEST_GIF:
             raise OutlapError(f"{path.name}: is too long for a .gif; make it smaller, shorter or slower, or an .mp4")
-        if on_progress is not None:
-            on_progress(number)
     # A GIF counts in hundredths of a second: every picture ends at the nearest one.
     ends = np.rint(100.0 / frames_per_second * np.arange(1, len(images) + 1)).astype(int)
     durations = (10 * np.diff(ends, prepend=0)).tolist()
@@ -179,8 +173,7 @@ def _write_gif(
 
 def _palette() -> Image.Image:
     """Every colour of a scene, mixed with white where lines are smoothed; the same for all pictures."""
-    colours = [bytes_of(colour) for colour in (*COLOURS, CRASH_RED, RACELINE)]
-    mixed = [tuple(round(v + (255 - v) * share) for v in colour) for colour in colours for share in MIXES]
+    mixed = [mixed_with_white(colour, share) for colour in (*COLOURS, CRASH_RED, RACELINE) for share in MIXES]
     greys = [(level, level, level) for level in range(0, 256, 15)]
     image = Image.new("P", (1, 1))
     image.putpalette([value for colour in dict.fromkeys([*mixed, *greys]) for value in colour])

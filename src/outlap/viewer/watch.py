@@ -10,6 +10,7 @@ from outlap.drivers.driver import Driver, ask
 from outlap.envs.frame import Frame, between, cast_of, frame_of
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
+from outlap.evaluation.recording import how_it_ended
 from outlap.evaluation.rollout import CURRICULA_OVER, single_race
 from outlap.track.track import Track
 from outlap.viewer.scene import Entry, Trail, pygame
@@ -115,9 +116,7 @@ class Watch:
         self._observation, _, terminated, truncated, info = self.env.step(ask(self.driver, self._observation, 1))
         self._now = frame_of(self.env)
         if terminated[0] or truncated[0]:
-            self._outcome, self._rest = str(info["outcome"][0]), REST
-            if info["contact"][0]:
-                self._outcome += f" into a {info['contact'][0]} at {info['impact_speed_mps'][0]:.1f} m/s"
+            self._outcome, self._rest = how_it_ended(info), REST
 
     def drive(self, car: int | None) -> None:
         """Take a car over at the keyboard, at the speed that it has; None: give it back."""
