@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from outlap.experiments.units import Report, Unit
+from outlap.experiments.unit import Report, Unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,16 +19,28 @@ class Fake(Unit):
     fails: bool = False
     dies: bool = False  # takes its process with it
     ticks: int = 1  # of 50 ms
+    until: str | None = None  # a file is there
+    on_gpu: bool = False
+    on_track: str | None = None
 
     @property
     def seconds(self) -> float:
         return 0.05 * self.ticks
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        return (self.on_track,) if self.on_track else ()
+
+    @property
+    def uses_gpu(self) -> bool:
+        return self.on_gpu
 
     def do(self, work: Path, report: Report) -> None:
         folder = self.folder(work)
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "begun").open("a") as file:
             file.write(f"{time.monotonic()}\n")
+        (folder / "gpus").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", ""))
         if self.dies:
             os._exit(9)
         if self.fails:
@@ -38,6 +50,9 @@ class Fake(Unit):
             time.sleep(0.05)
             path.write_text(str(tick + 1))
             report((tick + 1) / self.ticks)
+        while self.until and not Path(self.until).exists():
+            time.sleep(0.05)
+            report(0.99)
         (folder / "ended").write_text(str(time.monotonic()))
 
 

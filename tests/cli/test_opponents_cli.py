@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,9 @@ import pytest
 from outlap.cli.main import main
 from outlap.drivers.ghost import Ghost
 from outlap.drivers.population import read_manifest
-from outlap.training.population import Opponent, Plan
+from outlap.experiments.engine import Engine
+from outlap.experiments.population import OpponentUnit
+from outlap.training.population import Opponent
 from small_populations import driver, population, ring_driver, save_population
 from synthetic_tracks import ring
 
@@ -172,43 +174,47 @@ def test_no_training_meets_the_held_out_half(mixed: str, here: Path, fail: Calla
 
 
 @pytest.fixture
-def planned(monkeypatch: pytest.MonkeyPatch) -> list[Plan]:
-    """Plans that `opponents train` would carry out."""
-    plans: list[Plan] = []
+def planned(monkeypatch: pytest.MonkeyPatch) -> list[OpponentUnit]:
+    """Units that `opponents train` would do."""
+    planned: list[OpponentUnit] = []
 
-    def note(plan: Plan, jobs: int, on_progress: Any):
-        plans.append(plan)
+    def note(units: Sequence[OpponentUnit], work: Path, engine: Engine, on_status: Any) -> None:
+        planned.extend(units)
+
+    def enter(units: Sequence[OpponentUnit], work: Path, folder: Path, command: str) -> list[tuple]:
         rows = pd.DataFrame({"completed_laps": [5], "lap_time_s": [np.nan], "outcome": ["finished"]})
-        return [(opponent, rows, True) for opponent in plan.opponents[::-1]]
+        assert folder == Path("populations") / work.parent.name
+        return [(unit, rows, "entered") for unit in units]
 
-    monkeypatch.setattr("outlap.training.population.train_population", note)
-    return plans
+    monkeypatch.setattr("outlap.experiments.runner.run_units", note)
+    monkeypatch.setattr("outlap.experiments.population.enter_all", enter)
+    return planned
 
 
-def test_training_is_of_every_speed_of_both_halves(planned: list[Plan], call: Callable[..., Any]) -> None:
+def test_training_is_of_every_speed_of_both_halves(planned: list[OpponentUnit], call: Callable[..., Any]) -> None:
     words = ["--track", "ring5", "--speeds", "2.0:3.1:0.5", "--held-out", "3.5", "--steps", "1_000", "--quiet"]
     data = call("opponents", "train", *words)
-    (plan,) = planned
-    assert list(plan.opponents) == [
+    assert [unit.opponent for unit in planned] == [
         Opponent("ring5-2.0", 2.0, "train"), Opponent("ring5-2.5", 2.5, "train"), Opponent("ring5-3.0", 3.0, "train"),
         Opponent("ring5-3.5", 3.5, "held_out"),
     ]  # fmt: skip
-    assert (plan.folder, plan.settings.total_steps, plan.laps, plan.starts) == (Path("populations/ring5"), 1000, 5, 20)
-    assert [row["name"] for row in data["opponents"]] == [each.name for each in plan.opponents]
+    assert {(unit.settings.total_steps, unit.laps, unit.starts) for unit in planned} == {(1000, 5, 20)}
+    assert data["folder"] == "populations/ring5"
+    assert [row["name"] for row in data["opponents"]] == [unit.name for unit in planned]
 
 
-def test_the_last_speed_is_not_passed(planned: list[Plan], call: Callable[..., Any]) -> None:
+def test_the_last_speed_is_not_passed(planned: list[OpponentUnit], call: Callable[..., Any]) -> None:
     call("opponents", "train", "--track", "ring5", "--speeds", "2:3:0.6", "--held-out", "3.2", "--quiet")
-    assert [each.max_speed_mps for each in planned[0].opponents] == [2.0, 2.6, 3.2]
-    assert [each.split for each in planned[0].opponents] == ["train", "train", "held_out"]
+    assert [each.max_speed_mps for each in planned] == [2.0, 2.6, 3.2]
+    assert [each.split for each in planned] == ["train", "train", "held_out"]
 
 
 def test_a_tracks_name_becomes_one_that_files_can_have(
-    here: Path, planned: list[Plan], call: Callable[..., Any]
+    here: Path, planned: list[OpponentUnit], call: Callable[..., Any]
 ) -> None:
     replace(ring(radius=RADIUS), name="Ring (new) #2").save(here / "Ring (new) #2")
     call("opponents", "train", "--track", "./Ring (new) #2", "--speeds", "2:2:1", "--held-out", "3", "--quiet")
-    assert [each.name for each in planned[0].opponents] == ["Ring-new-2-2.0", "Ring-new-2-3.0"]
+    assert [each.name for each in planned] == ["Ring-new-2-2.0", "Ring-new-2-3.0"]
 
 
 @pytest.mark.parametrize(
@@ -232,7 +238,7 @@ def test_a_tracks_name_becomes_one_that_files_can_have(
     ],
 )
 def test_wrong_flags_of_a_training_are_one_line(
-    planned: list[Plan], fail: Callable[..., str], here: Path, words: list[str], message: str
+    planned: list[OpponentUnit], fail: Callable[..., str], here: Path, words: list[str], message: str
 ) -> None:
     assert message in fail("opponents", "train", "--track", "ring5", *words, "--quiet")
     assert planned == []

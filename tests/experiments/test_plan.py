@@ -12,7 +12,8 @@ from outlap.config import bounds
 from outlap.errors import OutlapError
 from outlap.experiments.definitions import FOLDERS, Budget
 from outlap.experiments.plan import Plan, artefacts, make_plan, remember_tracks
-from outlap.experiments.units import ClippingUnit, OpponentUnit, RaceUnit, TrainingUnit, adaptation_settings
+from outlap.experiments.population import OpponentUnit
+from outlap.experiments.units import ClippingUnit, RaceUnit, TrainingUnit, adaptation_settings
 from outlap.mql.propensity import AdaptiveBetaClip
 
 
@@ -233,11 +234,11 @@ def test_names_are_not_taken_twice(tmp_path: Path):
 def test_a_track_that_changes_under_its_name_is_noticed(tmp_path: Path):
     plan = make_plan(["table-1"], "smoke", ["follow-the-gap"], 1)
     assert plan.tracks == ["Emberley"]
-    remember_tracks(plan, tmp_path)
-    remember_tracks(plan, tmp_path)
+    remember_tracks(plan.tracks, tmp_path)
+    remember_tracks(plan.tracks, tmp_path)
     (tmp_path / "tracks.json").write_text('{"Emberley": "another"}')
     with pytest.raises(OutlapError, match="was made with another track called Emberley"):
-        remember_tracks(plan, tmp_path)
+        remember_tracks(plan.tracks, tmp_path)
 
 
 def test_the_papers_tables_and_figures_can_be_named():

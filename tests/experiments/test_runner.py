@@ -13,8 +13,9 @@ import pytest
 
 from fake_units import Fake, begun, ended
 from outlap.errors import OutlapError
+from outlap.experiments.engine import LocalEngine
 from outlap.experiments.runner import Status, _Pace, run_units
-from outlap.experiments.units import done_record
+from outlap.experiments.unit import done_record
 
 
 def test_units_wait_for_what_they_need_and_are_done_once(tmp_path: Path):
@@ -22,16 +23,18 @@ def test_units_wait_for_what_they_need_and_are_done_once(tmp_path: Path):
     second = Fake("second", ticks=2)
     last = Fake("last", before=(first, second))
     seen: list[Status] = []
-    run_units([first, second, last], tmp_path, jobs=2, on_status=seen.append)
+    before = dict(os.environ)
+    run_units([first, second, last], tmp_path, LocalEngine(2), on_status=seen.append)
+    assert os.environ == before
     assert begun(last, tmp_path)[0] >= max(ended(first, tmp_path), ended(second, tmp_path))
     assert (seen[-1].done, seen[-1].units, seen[-1].running) == (3, 3, ())
     assert seen[-1].work_done == pytest.approx(seen[-1].work)
     assert done_record(first, tmp_path)["seconds"] >= 0.1
-    run_units([first, second, last], tmp_path, jobs=2)
+    run_units([first, second, last], tmp_path, LocalEngine(2))
     assert [len(begun(unit, tmp_path)) for unit in (first, second, last)] == [1, 1, 1]
     # One that is new is done by itself.
     new = Fake("new", before=(first,))
-    run_units([first, new], tmp_path, jobs=2)
+    run_units([first, new], tmp_path, LocalEngine(2))
     assert [len(begun(unit, tmp_path)) for unit in (first, new)] == [1, 1]
 
 
@@ -41,12 +44,12 @@ def test_what_fails_stops_only_those_that_need_it(tmp_path: Path):
     later = Fake("later", before=(after,))
     other = Fake("other", ticks=2)
     with pytest.raises(OutlapError) as error:
-        run_units([broken, after, later, other], tmp_path, jobs=1)
+        run_units([broken, after, later, other], tmp_path, LocalEngine(1))
     assert "3 of 4 units of work failed, broken first (ValueError: no luck)" in str(error.value)
     assert other.is_done(tmp_path)
     assert not begun(after, tmp_path)
     with pytest.raises(OutlapError, match="broken first"):
-        run_units([broken, after, other], tmp_path, jobs=1)
+        run_units([broken, after, other], tmp_path, LocalEngine(1))
     assert [len(begun(unit, tmp_path)) for unit in (broken, other)] == [2, 1]
 
 
@@ -54,7 +57,7 @@ def test_a_process_that_dies_takes_no_other_unit_with_it(tmp_path: Path):
     deadly = Fake("deadly", dies=True)
     others = [Fake("other", ticks=6), Fake("next"), Fake("last")]
     with pytest.raises(OutlapError, match="1 of 4 units of work failed, deadly first") as error:
-        run_units([deadly, *others], tmp_path, jobs=2)
+        run_units([deadly, *others], tmp_path, LocalEngine(2))
     assert "BrokenProcessPool" in str(error.value)
     assert all(unit.is_done(tmp_path) for unit in others)
     assert len(begun(deadly, tmp_path)) == 2  # beside another one, and alone
@@ -63,9 +66,10 @@ def test_a_process_that_dies_takes_no_other_unit_with_it(tmp_path: Path):
 SCRIPT = """
 from pathlib import Path
 from fake_units import Fake
+from outlap.experiments.engine import LocalEngine
 from outlap.experiments.runner import run_units
 if __name__ == "__main__":
-    run_units([Fake("long", ticks=100)], Path("work"), jobs=1)
+    run_units([Fake("long", ticks=100)], Path("work"), LocalEngine(1))
 """
 
 
@@ -85,7 +89,7 @@ def test_after_ctrl_c_or_a_kill_the_same_units_go_on(by: signal.Signals, tmp_pat
     while not ticks.exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     with pytest.raises(OutlapError, match="another process is at work there"):
-        run_units([unit], work, jobs=1)
+        run_units([unit], work, LocalEngine(1))
     process.send_signal(by)
     process.wait(timeout=30)
     time.sleep(1.0)  # a worker whose parent was killed sees it at its next report
@@ -93,7 +97,7 @@ def test_after_ctrl_c_or_a_kill_the_same_units_go_on(by: signal.Signals, tmp_pat
     time.sleep(0.3)
     assert int(ticks.read_text()) == left < 100  # nobody works on
     assert not unit.is_done(work)
-    run_units([unit], work, jobs=1)
+    run_units([unit], work, LocalEngine(1))
     assert unit.is_done(work)
     assert len(begun(unit, work)) == 2
     assert done_record(unit, work)["seconds"] < 0.05 * (100 - left) + 10.0  # what was done is not done again
@@ -101,12 +105,14 @@ def test_after_ctrl_c_or_a_kill_the_same_units_go_on(by: signal.Signals, tmp_pat
 
 def test_estimates_follow_what_units_really_took(tmp_path: Path):
     units = [Fake(f"unit {number}", ticks=20) for number in range(8)]
-    pace = _Pace(units, tmp_path, jobs=2)
-    assert pace.status({}, 0, units).seconds_left == pytest.approx(8 * 1.0 / 2)
+    pace = _Pace(units, tmp_path)
+    assert pace.status(0, {}, units, slots=2).seconds_left == pytest.approx(8 * 1.0 / 2)
     for unit in units[:4]:
         pace.note(unit, 3.0)  # three times as long as was thought
-    left = pace.status({}, 4, units[4:]).seconds_left
+    left = pace.status(0, {}, units[4:], slots=2).seconds_left
     assert 4 * 1.0 / 2 < left < 4 * 3.0 / 2
     assert left == pytest.approx(4 * (4 * 3.0 + 1.0) / 5 / 2)
     # The last unit cannot be shared.
-    assert pace.status({units[7]: 0.5}, 7, [units[7]]).seconds_left == pytest.approx(0.5 * (4 * 3.0 + 1.0) / 5)
+    last = pace.status(7, {units[7].key: 0.5}, [units[7]], slots=2)
+    assert last.seconds_left == pytest.approx(0.5 * (4 * 3.0 + 1.0) / 5)
+    assert last.running == ("unit 7",)

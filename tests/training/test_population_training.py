@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-from collections.abc import Callable
-from concurrent.futures import Executor, Future
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,9 +15,12 @@ from stable_baselines3 import PPO
 from outlap.drivers.mlp import MLPDriver
 from outlap.drivers.population import MANIFEST, Member, file_hashes, load_population, read_manifest
 from outlap.envs.race_config import RaceConfig
-from outlap.errors import OutlapError
+from outlap.evaluation.results import ROWS, write_rows
+from outlap.experiments.engine import LocalEngine
+from outlap.experiments.population import OpponentUnit, enter_all
+from outlap.experiments.runner import run_units
 from outlap.simulator.vehicle import VehicleParams
-from outlap.training.population import SLOWEST, Opponent, Plan, enter, opponent_config, train_population, verify
+from outlap.training.population import SLOWEST, Opponent, enter, opponent_config, verify
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
 from small_populations import driver, ring_driver
@@ -38,32 +37,11 @@ TINY = PPOConfig(
 OPPONENTS = Opponent("ring-2.0", 2.0, "train"), Opponent("ring-3.0", 3.0, "held_out")
 
 
-class OneProcess(Executor):
-    """Trains in this process what a pool would train in others."""
-
-    def __init__(self, max_workers: int, mp_context: Any, initializer: Callable[..., None], initargs: tuple) -> None:
-        initializer(*initargs)
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        future: Future = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except BaseException as error:
-            future.set_exception(error)
-        return future
-
-
-@pytest.fixture
-def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("outlap.training.population.ProcessPoolExecutor", OneProcess)
-    monkeypatch.setattr("outlap.training.population._steps", None)  # which a worker keeps
-
-
 class Trained(NamedTuple):
-    plan: Plan
-    found: list[tuple[Opponent, pd.DataFrame, bool]]  # what the training yielded
-    reports: list[tuple[int, str]]
-    environment_changed: bool
+    units: tuple[OpponentUnit, ...]
+    work: Path
+    folder: Path  # of the population
+    found: list[tuple[OpponentUnit, pd.DataFrame, Member | None]]  # who was entered
 
 
 @pytest.fixture(scope="module")
@@ -72,101 +50,67 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     folder = tmp_path_factory.mktemp("population")
     track = ring(radius=5.0)
     map_folder = str(track.save(folder / "maps" / track.name))
-    plan = Plan(TINY, folder / "mine", track, map_folder, OPPONENTS, laps=1, starts=2, command="outlap made this")
-    stopped_after(256, opponent_config(TINY, map_folder, 2.0), plan.folder / "runs" / "ring-2.0")
-    before = dict(os.environ)
-    reports: list[tuple[int, str]] = []
-    found = list(train_population(plan, jobs=2, on_progress=lambda steps, note: reports.append((steps, note))))
-    return Trained(plan, found, reports, before != dict(os.environ))
+    units = tuple(
+        OpponentUnit(each.name, TINY, map_folder, each.max_speed_mps, each.split, laps=1, starts=2)
+        for each in OPPONENTS
+    )
+    work = folder / "mine" / "work"
+    stopped_after(256, opponent_config(TINY, map_folder, 2.0), units[0].run_folder(work))
+    run_units(units, work, LocalEngine(2))
+    return Trained(units, work, folder / "mine", enter_all(units, work, folder / "mine", "outlap made this"))
 
 
 def test_every_opponent_is_trained_and_verified(trained: Trained) -> None:
-    assert {opponent for opponent, _, _ in trained.found} == set(OPPONENTS)
-    for opponent, rows, passed in trained.found:
-        assert rows["driver"].tolist() == [opponent.name] * 2
+    assert [unit.opponent for unit, _, _ in trained.found] == list(OPPONENTS)
+    for unit, rows, member in trained.found:
+        assert rows["driver"].tolist() == [unit.name] * 2
         assert rows["track"].tolist() == ["ring5"] * 2
-        assert passed == (rows["completed_laps"].to_numpy() >= 1).all()
-        run = load_run(trained.plan.folder / "runs" / opponent.name)
+        assert (member is not None) == (rows["completed_laps"].to_numpy() >= 1).all()
+        run = load_run(unit.run_folder(trained.work))
         assert run.finished
         assert run.record()["steps"] == 512
         env = run.config.env
-        assert (env.num_cars, env.vehicle.v_max, env.speed_range) == (
-            1,
-            opponent.max_speed_mps,
-            (0.5, env.vehicle.v_max),
-        )
-    passed_names = {opponent.name for opponent, _, passed in trained.found if passed}
-    assert {member.name for member in read_manifest(trained.plan.folder, may_be_empty=True)} == passed_names
+        assert (env.num_cars, env.vehicle.v_max, env.speed_range) == (1, unit.max_speed_mps, (0.5, env.vehicle.v_max))
+    passed = {unit.name for unit, _, member in trained.found if member}
+    assert {member.name for member in read_manifest(trained.folder, may_be_empty=True)} == passed
 
 
-@pytest.mark.parametrize("opponent", OPPONENTS, ids=lambda each: each.name)
-def test_its_files_drive_as_its_policy_does(trained: Trained, opponent: Opponent) -> None:
-    ours = MLPDriver.load(trained.plan.folder / opponent.name)
-    assert (ours.name, ours.speeds, ours.beams) == (opponent.name, (SLOWEST, opponent.max_speed_mps), 8)
-    model = PPO.load(trained.plan.folder / "runs" / opponent.name / "policy.zip", device="cpu")
+@pytest.mark.parametrize("number", [0, 1])
+def test_its_files_drive_as_its_policy_does(trained: Trained, number: int) -> None:
+    unit = trained.units[number]
+    ours = MLPDriver.load(trained.folder / unit.name)
+    assert (ours.name, ours.speeds, ours.beams) == (unit.name, (SLOWEST, unit.max_speed_mps), 8)
+    model = PPO.load(unit.run_folder(trained.work) / "policy.zip", device="cpu")
     rng = np.random.default_rng(0)
     seen = {name: rng.normal(size=(20, size)).astype(np.float32) for name, size in ours.sizes.items()}
     np.testing.assert_allclose(ours.act(seen), model.predict(seen, deterministic=True)[0], atol=1e-5)
 
 
 def test_a_stopped_training_goes_on_and_no_other_one_is_resumed(trained: Trained) -> None:
-    sessions = {
-        each.name: len(load_run(trained.plan.folder / "runs" / each.name).record().get("resumed", []))
-        for each in OPPONENTS
-    }
-    assert sessions == {"ring-2.0": 1, "ring-3.0": 0}
+    sessions = [len(load_run(unit.run_folder(trained.work)).record().get("resumed", [])) for unit in trained.units]
+    assert sessions == [1, 0]
 
 
-def test_progress_is_of_all_trainings_together(trained: Trained) -> None:
-    steps = [done for done, _ in trained.reports]
-    assert steps == sorted(steps)
-    assert steps[-1] == 2 * 512
-    assert {name for _, note in trained.reports for name in note.split(", ")} == {"ring-2.0", "ring-3.0"}
-    assert not trained.environment_changed
+def test_entered_again_a_population_is_whole_again(trained: Trained) -> None:
+    files = {unit.name: file_hashes(trained.folder, unit.name) for unit in trained.units}
+    manifest = (trained.folder / MANIFEST).read_bytes()
+    (trained.folder / "ring-2.0.safetensors").unlink()
+    enter_all(trained.units, trained.work, trained.folder, "outlap made this")
+    assert {unit.name: file_hashes(trained.folder, unit.name) for unit in trained.units} == files
+    assert (trained.folder / MANIFEST).read_bytes() == manifest
 
 
-def test_the_same_plan_again_trains_nothing_anew(trained: Trained, one_process: None) -> None:
-    folder = trained.plan.folder
-    kept = [folder / "runs" / each.name / file for each in OPPONENTS for file in ("policy.zip", "run.json")]
-    before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in kept]
-    files = {each.name: file_hashes(folder, each.name) for each in OPPONENTS}
-    (folder / "ring-2.0.safetensors").unlink()
-    steps: list[int] = []
-    again = list(train_population(trained.plan, jobs=1, on_progress=lambda done, _: steps.append(done)))
-    assert steps[-1] == 2 * 512
-    assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in kept] == before
-    assert {each.name: file_hashes(folder, each.name) for each in OPPONENTS} == files
-    first = {opponent.name: rows for opponent, rows, _ in trained.found}
-    for opponent, rows, _ in again:
-        pd.testing.assert_frame_equal(rows, first[opponent.name])
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [TINY.model_copy(update={"seed": 1}), TINY.model_copy(update={"total_steps": 1024})],
-    ids=["seed", "steps"],
-)
-def test_another_configuration_in_the_same_folder_is_named(trained: Trained, settings: PPOConfig) -> None:
-    with pytest.raises(OutlapError, match=r"runs/ring-2\.0: was begun with another configuration; take another --out"):
-        next(train_population(replace(trained.plan, settings=settings), jobs=1))
-
-
-def test_only_those_that_passed_are_in_the_manifest(
-    trained: Trained, one_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def verified(driver: MLPDriver, *_: Any) -> pd.DataFrame:
-        return verification(3, 3) if driver.name == "ring-3.0" else verification(3, 2)
-
-    monkeypatch.setattr("outlap.training.population.verify", verified)
-    plan = replace(trained.plan, folder=Path(shutil.copytree(trained.plan.folder, tmp_path / "copy")), laps=3)
-    assert {opponent.name: passed for opponent, _, passed in train_population(plan)} == {
-        "ring-2.0": False, "ring-3.0": True,
-    }  # fmt: skip
-    (member,) = read_manifest(plan.folder)
+def test_only_those_that_passed_are_in_the_manifest(trained: Trained, tmp_path: Path) -> None:
+    work = Path(shutil.copytree(trained.work, tmp_path / "work"))
+    for unit, last in zip(trained.units, (0, 1), strict=True):  # completed laps of the second start
+        write_rows(verification(1, last).assign(track="ring5"), unit.folder(work) / ROWS)
+    found = enter_all(trained.units, work, tmp_path / "population", "outlap made this")
+    assert [member is not None for _, _, member in found] == [False, True]
+    (member,) = read_manifest(tmp_path / "population")
     assert (member.name, member.split, member.track, member.command) == (
         "ring-3.0", "held_out", "ring5", "outlap made this",
     )  # fmt: skip
-    assert (plan.folder / "ring-2.0.safetensors").is_file()
+    assert (tmp_path / "population" / "ring-2.0.safetensors").is_file()
 
 
 def test_verification_is_at_the_opponents_own_speeds_until_its_laps_are_done() -> None:

@@ -58,6 +58,8 @@ COMMANDS = (
     Entry("train ppo", "outlap.cli.train:TrainPPO", "train a policy with PPO and domain randomization"),
     Entry("train mql", "outlap.cli.train:TrainMQL", "meta-train a policy with Meta-Q-Learning"),
     Entry("train recurrent-ppo", "outlap.cli.train:TrainRecurrentPPO", "train PPO with a memory"),
+    Entry("sweep", "outlap.cli.sweep:Sweep", "search for hyper-parameters: train and race every trial"),
+    Entry("tune", "outlap.cli.sweep:Tune", "search for hyper-parameters with Ray Tune, stopping early"),
     Entry("compare", "outlap.cli.compare:Compare", "race runs on the same episodes, and what that shows"),
     Entry("reproduce", "outlap.cli.reproduce:Reproduce", "make every table and figure of the paper"),
     Entry("opponents train", "outlap.cli.opponents:TrainOpponents", "train a population of opponents"),

@@ -17,6 +17,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
+from outlap.cli.work import WorkFlags
 from outlap.drivers.population import Split, load_population, read_manifest
 from outlap.errors import OutlapError
 from outlap.training.population import opponent_defaults
@@ -32,7 +33,7 @@ Flag = FlagCreatePairsOff[bool]
 
 
 @dataclass(frozen=True)
-class TrainOpponents:
+class TrainOpponents(WorkFlags):
     """Train a population of opponents: one PPO policy for every top speed, verified before it may race.
 
     A population that was stopped goes on with the same command.
@@ -58,9 +59,6 @@ class TrainOpponents:
     starts: int = 20
     """Of its verification."""
 
-    jobs: int = 0
-    """Trainings at a time; 0: one a core."""
-
     quiet: Flag = False
     """Show no progress."""
 
@@ -68,26 +66,23 @@ class TrainOpponents:
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
+        from outlap.experiments.population import OpponentUnit, enter_all
         from outlap.track import Track
-        from outlap.training.population import Plan, train_population
 
         check_least("--laps", self.laps, 1)
         check_least("--starts", self.starts, 1)
-        check_least("--jobs", self.jobs, 0)
+        self.check_flags()
         track = Track.load(self.track)
         folder = self.out or Path("populations") / track.name
         opponents = _opponents(track.name, _span(self.speeds), self.held_out)
+        units = [
+            OpponentUnit(each.name, self.settings, self.track, each.max_speed_mps, each.split, self.laps, self.starts)
+            for each in opponents
+        ]
+        self.do_units(units, folder / "work", "training", self.quiet)
         command = shlex.join(["outlap", *sys.argv[1:]])
-        plan = Plan(self.settings, folder, track, self.track, opponents, self.laps, self.starts, command)
-        found = {}
-        with progress_bar("training", len(opponents) * self.settings.total_steps, "steps", self.quiet) as update:
-            try:
-                for opponent, rows, passed in train_population(plan, self.jobs, update):
-                    found[opponent.name] = _row(opponent, rows, passed)
-            except KeyboardInterrupt:
-                print("\nsaved; go on with the same command", file=sys.stderr)
-                raise
-        rows = [found[opponent.name] for opponent in opponents]
+        entered = enter_all(units, folder / "work", folder, command)
+        rows = [_row(unit.opponent, found, member is not None) for unit, found, member in entered]
         data = {"folder": folder, "opponents": rows}
         return CommandResult(data, lambda console: _print(console, rows, folder))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,20 +12,20 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
-from outlap.cli.progress import progress_bar
+from outlap.cli.work import WorkFlags, duration
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from outlap.experiments.units import Unit
+    from outlap.experiments.unit import Unit
 
 
 SHOWN = {"overtakes": "overtakes in 500", "crashes": "crashes in 500", "progress_m": "progress [m]"}
 
 
 @dataclass(frozen=True)
-class Reproduce:
+class Reproduce(WorkFlags):
     """Make the paper's tables and figures: train what is missing, adapt, race, and write a report.
 
     Whatever is done is kept in --out: the same command goes on after a kill, and a changed configuration does anew
@@ -45,9 +44,6 @@ class Reproduce:
     seeds: int | None = None
     """Trainings of every method, in place of the budget's."""
 
-    jobs: int = 0
-    """Units of work at a time; 0: one a core."""
-
     out: Path | None = None
     """The folder for the report and the work; by default runs/reproduce-BUDGET."""
 
@@ -61,33 +57,17 @@ class Reproduce:
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
-        from outlap.experiments.plan import make_plan, remember_tracks
+        from outlap.experiments.plan import make_plan
         from outlap.experiments.report import write_report
-        from outlap.experiments.runner import Status, run_units
 
-        check_least("--jobs", self.jobs, 0)
+        self.check_flags()
         check_least("--seeds", 1 if self.seeds is None else self.seeds, 1)
         plan = make_plan(self.wanted, self.budget, self.methods, self.seeds)
         folder = self.out or Path("runs") / f"reproduce-{plan.budget_name}"
         work = folder / "work"
-        units = plan.units
-        missing = [unit for unit in units if not unit.is_done(work)]
         if self.dry_run:
-            return _dry(units, missing, self.jobs)
-        remember_tracks(plan, work)
-        with progress_bar("reproducing", 1000, "‰", self.quiet) as update:
-
-            def show(status: Status) -> None:
-                note = f"{status.done} of {status.units} units"
-                if status.running:
-                    note += f", {_duration(status.seconds_left)} left: {', '.join(status.running)}"
-                update(round(1000 * status.work_done / status.work), note)
-
-            try:
-                run_units(units, work, self.jobs, show)
-            except KeyboardInterrupt:
-                print("\nsaved; go on with the same command", file=sys.stderr)
-                raise
+            return _dry(plan.units, [unit for unit in plan.units if not unit.is_done(work)], self.jobs)
+        self.do_units(plan.units, work, "reproducing", self.quiet)
         data = write_report(plan, folder)
         return CommandResult({**data, "folder": folder}, lambda console: _print(console, data, folder))
 
@@ -114,15 +94,10 @@ def _dry(units: Sequence[Unit], missing: Sequence[Unit], jobs: int) -> CommandRe
         for kind, found in kinds.items():
             console.print(f"{len(found):5} {kind}", highlight=False)
         console.print(
-            f"about {_duration(seconds)}; {len(units) - len(missing)} of {len(units)} are done", highlight=False
+            f"about {duration(seconds)}; {len(units) - len(missing)} of {len(units)} are done", highlight=False
         )
 
     return CommandResult(data, show)
-
-
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60.0)
-    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{max(minutes, 1)} min"
 
 
 def _print(console: Console, data: Mapping[str, Any], folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -19,6 +20,7 @@ from outlap.viewer.plots import WIDTH, finish, new_figure
 RULES = {"none": "no clip", "fixed": "fixed clip", "abc": "ABC", "uniform": "β = 1"}
 RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uniform": COLOURS[7]}
 POINTS = 60  # of a learning curve
+TITLE_WIDTH = 90  # characters
 
 
 class Interval(Protocol):
@@ -65,7 +67,7 @@ def draw_intervals(
         mark = Line2D([], [], color=INK, marker="x", linestyle="none", markersize=6, label="the paper")
         figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=7)
     if title:
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+        _entitle(figure, title)
     return finish(figure)
 
 
@@ -89,7 +91,7 @@ def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str], tit
     figure.legend(
         *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=7
     )
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    _entitle(figure, title)
     return finish(figure)
 
 
@@ -123,7 +125,7 @@ def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> F
         figure.legend(
             *returns.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=7
         )
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    _entitle(figure, title)
     return finish(figure)
 
 
@@ -174,7 +176,7 @@ def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame, title: str) ->
     figure.legend(
         *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
     )
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    _entitle(figure, title)
     return finish(figure)
 
 
@@ -204,8 +206,13 @@ def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame, title: str) ->
     largest.set(yscale="log")
     largest.set_xlabel("replay update (median over adaptations)", fontsize=8)
     largest.legend(fontsize=7, frameon=False)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    _entitle(figure, title)
     return finish(figure)
+
+
+def _entitle(figure: Figure, title: str) -> None:
+    """A title in as many lines as it needs."""
+    figure.suptitle(textwrap.fill(title, TITLE_WIDTH), x=0.01, ha="left", fontsize=10, fontweight="bold")
 
 
 def read_learning(folder: Path) -> pd.DataFrame:

@@ -14,17 +14,9 @@ from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
 from outlap.experiments.definitions import Budget, Circuits, Method, TaskSet, changed, find, merge, names_of
-from outlap.experiments.units import (
-    POPULATION,
-    ClippingUnit,
-    OpponentUnit,
-    PopulationUnit,
-    RaceUnit,
-    Task,
-    TrainingUnit,
-    Unit,
-    adaptation_settings,
-)
+from outlap.experiments.population import OpponentUnit, PopulationUnit
+from outlap.experiments.unit import Unit
+from outlap.experiments.units import POPULATION, ClippingUnit, RaceUnit, Task, TrainingUnit, adaptation_settings
 from outlap.files import atomic_write, to_json
 from outlap.track.catalog import find_entry
 from outlap.track.track import Track
@@ -67,18 +59,7 @@ class Plan:
     @property
     def tracks(self) -> list[str]:
         """Names of all tracks that anything is done on."""
-        names: set[str] = set()
-        for unit in self.units:
-            match unit:
-                case TrainingUnit():
-                    names |= {*unit.config.env.tracks}
-                case RaceUnit():
-                    names |= {task.track for task in unit.tasks}
-                case ClippingUnit():
-                    names.add(unit.task.track)
-                case OpponentUnit():
-                    names.add(unit.track)
-        return sorted(names)
+        return sorted({name for unit in self.units for name in unit.tracks})
 
     @property
     def units(self) -> tuple[Unit, ...]:
@@ -121,18 +102,19 @@ def make_plan(
     return _Planner(budget_name, methods, seeds).plan(wanted)
 
 
-def remember_tracks(plan: Plan, work: Path) -> None:
-    """Note in a folder of work which tracks it is about: their names do not say.
+def remember_tracks(names: Iterable[str], work: Path) -> dict[str, str]:
+    """Note in a folder of work which tracks it is about, since their names do not say; returns their fingerprints.
 
     Raises OutlapError for a track that is another one than when work was done there.
     """
     path = work / "tracks.json"
     known: dict[str, str] = json.loads(path.read_text()) if path.exists() else {}
-    for name in plan.tracks:
+    for name in names:
         fingerprint = Track.load(name).fingerprint
         if known.setdefault(name, fingerprint) != fingerprint:
             raise OutlapError(f"{work}: was made with another track called {name}; give another --out, or remove it")
     atomic_write(path, to_json(known) + "\n")
+    return known
 
 
 class _Planner:

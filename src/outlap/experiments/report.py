@@ -15,6 +15,7 @@ from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments import figures
 from outlap.experiments.document import Document
 from outlap.experiments.plan import CLIPPING_TASKS, Plan
+from outlap.experiments.population import OpponentUnit
 from outlap.experiments.results import (
     METRICS,
     Cell,
@@ -25,7 +26,8 @@ from outlap.experiments.results import (
     read_rows,
     table_result,
 )
-from outlap.experiments.units import COLLECTING_WORLDS, OpponentUnit, adaptation_settings, done_record
+from outlap.experiments.unit import done_record
+from outlap.experiments.units import COLLECTING_WORLDS, adaptation_settings
 from outlap.files import atomic_write, to_json
 from outlap.mql.propensity import CLIP_RULES
 from outlap.training.run import provenance
@@ -256,7 +258,7 @@ def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
     document.text("## Appendix")
     if plan.opponents:
         curves = {
-            f"{unit.max_speed_mps:g} m/s": [figures.read_learning(_opponent_run(unit, work))] for unit in plan.opponents
+            f"{unit.max_speed_mps:g} m/s": [figures.read_learning(unit.run_folder(work))] for unit in plan.opponents
         }
         document.text("### A: opponents of every top speed learn", _verification(plan.opponents, work))
         document.figure("appendix-a", figures.draw_learning(curves, "Appendix A: PPO for every top speed"))
@@ -277,10 +279,6 @@ def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
             histograms, updates = _read_clipping(plan, work, "histograms"), _read_clipping(plan, work, "updates")
             title = f"Appendix D: β and ABC's β during adaptation; {plan.circuits[CLIPPING_TASKS].title}"
             document.figure("appendix-d", figures.draw_weights(histograms, updates, title))
-
-
-def _opponent_run(unit: OpponentUnit, work: Path) -> Path:
-    return unit.folder(work) / "runs" / unit.name
 
 
 def _verification(opponents: Sequence[OpponentUnit], work: Path) -> str:

@@ -1,29 +1,23 @@
-"""Units of work: a folder each, written once and used again by everything that needs it.
-
-A unit's folder is named by a hash of what it is made of, the units that it needs included: whatever changes gets a
-new folder, and nothing else is done again. A unit is done when its `done.json` is there.
-"""
+"""The units of work that tables and figures are made of: trainings, races, comparisons of clip rules."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from outlap.config import save_config
 from outlap.drivers.driver import Driver
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.definitions import changed
-from outlap.files import atomic_write, to_json
+from outlap.experiments.population import PopulationUnit
+from outlap.experiments.unit import Report, Unit
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.session import TrainingConfig
@@ -33,124 +27,9 @@ if TYPE_CHECKING:
     from outlap.mql.mql import MQL
     from outlap.training.run import Run
 
-VERSION = 1  # of what units write; another one does everything again
-DONE = "done.json"
 POPULATION = "population"  # stands for the population that an experiment trained, or the one that comes with outlap
 COLLECTING_WORLDS = 8  # cars that collect the transitions of a new task
 COLLECTING_SEED = 10_000  # apart from those of races
-Report = Callable[[float], None]  # called with the share that is done, now and then
-
-
-@dataclass(frozen=True, eq=False)
-class Unit:
-    """A piece of work. Fields say what it is made of; those that are units are what it needs."""
-
-    name: str
-    kind: ClassVar[str]
-
-    @cached_property
-    def needs(self) -> tuple[Unit, ...]:
-        """Units that must be done before."""
-        found: list[Unit] = []
-        for each in fields(self):
-            value = getattr(self, each.name)
-            found += [one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Unit)]
-        return tuple(found)
-
-    @cached_property
-    def key(self) -> str:
-        """The hash."""
-        made_of: dict[str, Any] = {"version": VERSION, "kind": self.kind, "needs": [unit.key for unit in self.needs]}
-        for each in fields(self):
-            value = getattr(self, each.name)
-            needed = isinstance(value, Unit) or (isinstance(value, tuple) and any(isinstance(v, Unit) for v in value))
-            if not needed:
-                made_of[each.name] = value
-        return hashlib.sha256(to_json(made_of).encode()).hexdigest()[:12]
-
-    @property
-    def seconds(self) -> float:
-        """About how long it takes on one core."""
-        raise NotImplementedError
-
-    def folder(self, work: Path) -> Path:
-        """Where it is, in a folder of work."""
-        return work / self.kind / f"{self.name}-{self.key}"
-
-    def is_done(self, work: Path) -> bool:
-        """Whether nothing is left to do."""
-        return (self.folder(work) / DONE).is_file()
-
-    def do(self, work: Path, report: Report) -> None:
-        """Do it, or go on with it, in its folder. Raises KeyboardInterrupt where `report` does, its work saved."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, eq=False)
-class OpponentUnit(Unit):
-    """One opponent, trained and verified."""
-
-    kind = "opponents"
-    settings: TrainingConfig
-    track: str
-    max_speed_mps: float
-    split: str
-    laps: int
-    starts: int = 20
-
-    @property
-    def seconds(self) -> float:
-        return 5.0 + self.settings.total_steps / 11_000
-
-    def do(self, work: Path, report: Report) -> None:
-        from outlap.track.track import Track
-        from outlap.training.population import Opponent, Plan, train_opponent
-
-        track = Track.load(self.track)
-        opponent = Opponent(self.name, self.max_speed_mps, self.split)  # type: ignore[arg-type]
-        plan = Plan(
-            self.settings,  # type: ignore[arg-type]
-            self.folder(work), track, self.track, [opponent], self.laps, self.starts, command="outlap reproduce",
-        )  # fmt: skip
-        total = self.settings.total_steps
-        rows = train_opponent(plan, opponent, lambda steps: report(0.95 * steps / total))
-        write_rows(rows, self.folder(work) / ROWS)
-
-
-@dataclass(frozen=True, eq=False)
-class PopulationUnit(Unit):
-    """The opponents that passed their verification, as a population."""
-
-    kind = "populations"
-    opponents: tuple[OpponentUnit, ...]
-
-    @property
-    def seconds(self) -> float:
-        return 1.0
-
-    def do(self, work: Path, report: Report) -> None:
-        from outlap.drivers.population import file_names
-        from outlap.training.population import Opponent, enter
-
-        folder = self.folder(work)
-        passed: list[OpponentUnit] = []
-        for unit in self.opponents:
-            source = unit.folder(work)
-            rows = pd.read_parquet(source / ROWS)
-            folder.mkdir(parents=True, exist_ok=True)
-            for file in file_names(unit.name):
-                shutil.copyfile(source / file, folder / file)
-            opponent = Opponent(unit.name, unit.max_speed_mps, unit.split)  # type: ignore[arg-type]
-            if enter(folder, opponent, rows, unit.track, unit.laps, "outlap reproduce"):
-                passed.append(unit)
-        failed = [unit.name for unit in self.opponents if unit not in passed]
-        atomic_write(folder / "failed.json", to_json(failed))
-        held_out = [unit.name for unit in self.opponents if unit.split == "held_out" and unit not in passed]
-        if held_out or all(unit.split == "held_out" for unit in passed):
-            raise OutlapError(
-                f"opponents {', '.join(failed)}: did not complete {self.opponents[0].laps} laps from every start; "
-                "give the budget's population more total_steps"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +39,14 @@ class TrainingUnit(Unit):
     kind = "trainings"
     config: TrainingConfig
     population: PopulationUnit | None = None
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        return self.config.env.tracks
+
+    @property
+    def uses_gpu(self) -> bool:
+        return self.config.device.startswith("cuda")
 
     @property
     def seconds(self) -> float:
@@ -179,9 +66,11 @@ class TrainingUnit(Unit):
         from outlap.training.run import load_run
         from outlap.training.session import train
 
-        folder = self.folder(work)
-        begun = load_run(folder) if (folder / "config.yaml").is_file() else None
-        config = begun.config if begun else self.config.model_copy(update={"env": self.resolved(work)})
+        folder, begun = self.folder(work), None
+        config = self.config.model_copy(update={"env": self.resolved(work)})
+        if (folder / "config.yaml").is_file():
+            save_config(config, folder / "config.yaml")  # the opponents may be elsewhere on this machine
+            begun = load_run(folder)
         train(config, folder, resume=begun, on_progress=lambda progress: report(progress.steps / progress.total_steps))
 
     def resolved(self, work: Path) -> RaceConfig:
@@ -234,6 +123,14 @@ class RaceUnit(Unit):
     training: TrainingUnit | None = None
     adaptation: Mapping[str, Any] | None = None
     population: PopulationUnit | None = None
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        return tuple(task.track for task in self.tasks)
+
+    @property
+    def uses_gpu(self) -> bool:
+        return self.adaptation is not None and self.training is not None and self.training.uses_gpu
 
     @property
     def seconds(self) -> float:
@@ -300,6 +197,14 @@ class ClippingUnit(Unit):
     settings: Mapping[str, Any]
     batches: int  # for the variance of the gradient
     training: TrainingUnit
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        return (self.task.track,)
+
+    @property
+    def uses_gpu(self) -> bool:
+        return self.training.uses_gpu
 
     @property
     def seconds(self) -> float:
@@ -378,8 +283,3 @@ def _check_numbers(where: str, changes: Mapping[str, Any], defaults: Mapping[str
         if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or value < 0:
             kind = "a whole number" if whole else "a number"
             raise OutlapError(f"{where}: {name} is {value!r}; must be {kind}, 0 or more")
-
-
-def done_record(unit: Unit, work: Path) -> dict[str, Any]:
-    """What was noted when a unit was done."""
-    return json.loads((unit.folder(work) / DONE).read_text())

@@ -1,0 +1,110 @@
+"""The units of work that a population of opponents is made of, and the population that they make."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from outlap.drivers.population import Member, file_names
+from outlap.errors import OutlapError
+from outlap.evaluation.results import ROWS, write_rows
+from outlap.experiments.unit import Report, Unit
+from outlap.files import replacing
+from outlap.track.track import Track
+from outlap.training.population import Opponent, enter, train_opponent, verify
+from outlap.training.ppo import PPOConfig
+
+COMMAND = "outlap reproduce"  # for the manifest of a population that an experiment trains
+
+
+@dataclass(frozen=True, eq=False)
+class OpponentUnit(Unit):
+    """One opponent, trained and verified."""
+
+    kind = "opponents"
+    settings: PPOConfig
+    track: str
+    max_speed_mps: float
+    split: str
+    laps: int
+    starts: int = 20
+
+    @property
+    def seconds(self) -> float:
+        return 5.0 + self.settings.total_steps / 11_000
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        return (self.track,)
+
+    @property
+    def uses_gpu(self) -> bool:
+        return self.settings.device.startswith("cuda")
+
+    @property
+    def opponent(self) -> Opponent:
+        """What is trained."""
+        return Opponent(self.name, self.max_speed_mps, self.split)  # type: ignore[arg-type]
+
+    def run_folder(self, work: Path) -> Path:
+        """Of its training."""
+        return self.folder(work) / "runs" / self.name
+
+    def do(self, work: Path, report: Report) -> None:
+        folder, total = self.folder(work), self.settings.total_steps
+        driver = train_opponent(
+            self.opponent, self.settings, self.track, self.run_folder(work), lambda steps: report(0.95 * steps / total)
+        )
+        driver.save(folder / self.name)
+        track = Track.load(self.track)
+        write_rows(verify(driver, self.settings.env, track, self.laps, self.starts), folder / ROWS)
+
+
+@dataclass(frozen=True, eq=False)
+class PopulationUnit(Unit):
+    """The opponents that passed their verification, as a population."""
+
+    kind = "populations"
+    opponents: tuple[OpponentUnit, ...]
+
+    @property
+    def seconds(self) -> float:
+        return 1.0
+
+    def do(self, work: Path, report: Report) -> None:
+        passed = [unit for unit, _, member in enter_all(self.opponents, work, self.folder(work), COMMAND) if member]
+        failed = [unit for unit in self.opponents if unit not in passed]
+        if any(unit.split == "held_out" for unit in failed) or all(unit.split == "held_out" for unit in passed):
+            raise OutlapError(
+                f"opponents {', '.join(unit.name for unit in failed)}: did not complete {self.opponents[0].laps} laps "
+                "from every start; give the budget's population more total_steps"
+            )
+
+
+def enter_all(
+    units: Sequence[OpponentUnit], work: Path, folder: Path, command: str
+) -> list[tuple[OpponentUnit, pd.DataFrame, Member | None]]:
+    """Copy opponents that are done into a population's folder, and enter those that passed into its manifest.
+
+    Args:
+        units: the opponents.
+        work: where they are.
+        folder: of the population; others that are in it stay.
+        command: that trained them.
+
+    Returns:
+        Each with the rows of its verification, and what the manifest says; None of one that failed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for unit in units:
+        for file in file_names(unit.name):
+            with replacing(folder / file) as partial:
+                shutil.copyfile(unit.folder(work) / file, partial)
+        rows = pd.read_parquet(unit.folder(work) / ROWS)
+        found.append((unit, rows, enter(folder, unit.opponent, rows, str(rows["track"].iloc[0]), unit.laps, command)))
+    return found

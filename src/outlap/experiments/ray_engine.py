@@ -1,0 +1,291 @@
+"""Units of work on the machines of a Ray cluster, or on this one: each a Ray task that declares what it needs.
+
+The machines share the folder of work, or hand units to each other through an object store. Where a machine is lost,
+Ray does its units again elsewhere, from what they had saved; those that were done stay done.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from outlap.errors import OutlapError
+from outlap.experiments.engine import Outcome, do_unit
+from outlap.experiments.store import Store
+from outlap.experiments.unit import Unit
+
+RETRIES = 5  # of a unit whose process or machine is lost
+REPORT_EVERY = 1.0  # [s] between two reports of how far a unit is
+STORE_EVERY = 120.0  # [s] between two copies of an unfinished unit in the store
+PATIENCE = 60.0  # [s] for units to save what they have, after Ctrl-C
+QUEUE = 10_000  # units that Ray may have at a time, most of them waiting: that is what clusters grow by
+
+
+def join_cluster(address: str | None) -> bool:
+    """Join a Ray cluster, or begin one of this machine; False if this process is in one already.
+
+    Raises OutlapError where Ray is not installed, or none answers.
+    """
+    ray = import_ray()
+    if ray.is_initialized():
+        return False
+    try:
+        ray.init(address=address, logging_level=logging.WARNING, log_to_driver=False)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise OutlapError(f"--address {address}: no Ray cluster answers there: {error}") from None
+    return True
+
+
+def import_ray() -> Any:
+    """The package. Raises OutlapError where it is not installed."""
+    try:
+        import ray
+    except ImportError:
+        raise OutlapError("Ray is not installed; get it with pip install 'outlap[distributed]'") from None
+    return ray
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a process of Ray's takes over from the one that the work began in."""
+
+    folder: Path  # where relative names of tracks begin
+    variables: Mapping[str, str]  # of the environment
+
+    @classmethod
+    def here(cls) -> Surroundings:
+        """Those of this process."""
+        return cls(Path.cwd(), {name: value for name, value in os.environ.items() if name.startswith("OUTLAP_")})
+
+    def settle_in(self) -> None:
+        """Take them over, and keep one core busy, no more."""
+        import numba
+
+        numba.set_num_threads(1)  # PyTorch's are one already: Ray says so by OMP_NUM_THREADS
+        os.environ.update(self.variables)
+        if self.folder.is_dir():
+            os.chdir(self.folder)
+
+
+class RayEngine:
+    """A Ray cluster.
+
+    Args:
+        address: of its head, as `ray.init` takes it; None: RAY_ADDRESS, or else a cluster of this machine alone.
+        store: URL of an object store; None: all machines see the folder of work under the same path.
+        jobs: units at a time; 0: as many as the cluster has cores.
+        gpu_share: of a GPU, for each unit that uses one.
+        tracks: fingerprints that tracks must have on every machine, by their names.
+
+    Raises OutlapError where Ray is not installed.
+    """
+
+    def __init__(
+        self,
+        address: str | None = None,
+        store: str | None = None,
+        jobs: int = 0,
+        gpu_share: float = 1.0,
+        tracks: Mapping[str, str] | None = None,
+    ) -> None:
+        self._ray = import_ray()
+        self._address, self._jobs, self._gpu_share = address, jobs, gpu_share
+        self._tracks = dict(tracks or {})
+        self._store = Store(store) if store else None
+        self._running: dict[Any, Unit] = {}
+        self._began_ray = False
+
+    @property
+    def limit(self) -> int:
+        return self._jobs or QUEUE
+
+    @property
+    def slots(self) -> int:
+        cores = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+        return min(self._jobs or cores, cores)
+
+    def open(self, units: Sequence[Unit], work: Path) -> None:
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        self._work = work.absolute()
+        if self._store is not None:
+            self._store.check()
+            there = self._store.done()
+            for unit in units:
+                if unit.key in there:
+                    self._store.get(unit, self._work)
+        self._began_ray = join_cluster(self._address)
+        here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
+        board = self._ray.remote(_Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
+        self._board = board.remote()
+        url = self._store.url if self._store else None
+        self._orders = _Orders(self._work, url, self._tracks, Surroundings.here())
+        self._task = self._ray.remote(num_cpus=1, max_retries=RETRIES)(_do_there)
+
+    def submit(self, unit: Unit) -> None:
+        task = self._task.options(name=unit.name, num_gpus=self._gpu_share if unit.uses_gpu else 0)
+        self._running[task.remote(unit, self._orders, self._board)] = unit
+
+    def wait(self, timeout: float) -> list[Outcome]:
+        finished, _ = self._ray.wait(list(self._running), num_returns=1, timeout=timeout)
+        return [self._outcome(reference) for reference in finished]
+
+    def _outcome(self, reference: Any) -> Outcome:
+        unit = self._running.pop(reference)
+        try:
+            seconds = self._ray.get(reference)
+        except self._ray.exceptions.RayTaskError as error:
+            cause = error.cause
+            return Outcome(unit, error=cause if isinstance(cause, Exception) else error)
+        except self._ray.exceptions.RayError as error:  # lost more often than it may be tried again
+            return Outcome(unit, error=error)
+        if self._store is not None:
+            self._store.get(unit, self._work)
+        return Outcome(unit, seconds)
+
+    def shares(self) -> Mapping[str, float]:
+        try:
+            return self._ray.get(self._board.shares.remote(), timeout=5.0)
+        except self._ray.exceptions.RayError:  # on its way to another machine
+            return {}
+
+    def close(self) -> None:
+        if self._running:
+            self._ray.get(self._board.stop.remote())
+            begun = self.shares()
+            for reference, unit in self._running.items():
+                if unit.key not in begun:
+                    self._ray.cancel(reference)
+            working = [reference for reference, unit in self._running.items() if unit.key in begun]
+            if working:
+                self._ray.wait(working, num_returns=len(working), timeout=PATIENCE)
+        if self._began_ray:
+            self._ray.shutdown()
+
+
+class _Board:
+    """An actor that units tell how far they are, and that tells them when to stop."""
+
+    def __init__(self) -> None:
+        self._shares: dict[str, float] = {}
+        self._stopped = False
+
+    def report(self, key: str, share: float) -> bool:
+        """Note how far a unit is; whether it is to stop."""
+        self._shares[key] = share
+        return self._stopped
+
+    def leave(self, key: str) -> None:
+        """A unit does not run any more."""
+        self._shares.pop(key, None)
+
+    def shares(self) -> dict[str, float]:
+        return self._shares
+
+    def stop(self) -> None:
+        self._stopped = True
+
+
+@dataclass(frozen=True)
+class _Orders:
+    """What every machine must know."""
+
+    work: Path
+    store: str | None  # URL
+    tracks: Mapping[str, str]  # fingerprints by name
+    surroundings: Surroundings
+
+
+def _do_there(unit: Unit, orders: _Orders, board: Any) -> float | None:
+    """Do a unit on whatever machine this is; None where it was stopped."""
+    import ray
+    from ray.exceptions import RayError
+
+    def tell(share: float) -> bool:
+        try:
+            return ray.get(board.report.remote(unit.key, share), timeout=10.0)
+        except RayError:  # on its way to another machine: nobody says to stop
+            return False
+
+    try:
+        if tell(0.0):
+            return None
+        orders.surroundings.settle_in()
+        _check_tracks({name: orders.tracks[name] for name in unit.tracks if name in orders.tracks})
+        if orders.store is None:
+            return _do_in_common_folder(unit, orders.work, tell)
+        with tempfile.TemporaryDirectory(prefix="outlap-") as scratch:
+            return _do_with_store(unit, Path(scratch), Store(orders.store), tell)
+    except KeyboardInterrupt:
+        return None
+    finally:
+        board.leave.remote(unit.key)
+
+
+def _do_in_common_folder(unit: Unit, work: Path, tell: Any) -> float:
+    if not (work / ".lock").is_file():  # of the process that hands out the units
+        raise OutlapError(f"{work}: is not seen by machine {os.uname().nodename}; give an --out that is, or a --store")
+    return do_unit(unit, work, _every(REPORT_EVERY, lambda share: _stop_if(tell(share))))
+
+
+def _do_with_store(unit: Unit, scratch: Path, store: Store, tell: Any) -> float:
+    for needed in {each.key: each for each in _all_needs(unit)}.values():
+        if not store.get(needed, scratch):
+            raise OutlapError(f"{store.url}: has lost {needed.name}, which {unit.name} needs; run it all again")
+    store.get(unit, scratch)
+    keep = _every(STORE_EVERY, lambda _: store.put_part(unit, scratch))
+    ask = _every(REPORT_EVERY, lambda share: _stop_if(tell(share)))
+
+    def report(share: float) -> None:
+        keep(share)
+        ask(share)
+
+    try:
+        seconds = do_unit(unit, scratch, report)
+    except KeyboardInterrupt:
+        store.put_part(unit, scratch)
+        raise
+    store.put(unit, scratch)
+    return seconds
+
+
+def _all_needs(unit: Unit) -> Iterable[Unit]:
+    for needed in unit.needs:
+        yield from _all_needs(needed)
+        yield needed
+
+
+def _stop_if(stopped: bool) -> None:
+    if stopped:
+        raise KeyboardInterrupt
+
+
+def _every(seconds: float, report: Any) -> Any:
+    """A report that is made so often at most."""
+    last = time.monotonic()
+
+    def sometimes(share: float) -> None:
+        nonlocal last
+        if time.monotonic() - last >= seconds:
+            last = time.monotonic()
+            report(share)
+
+    return sometimes
+
+
+def _check_tracks(fingerprints: Mapping[str, str]) -> None:
+    """Raises OutlapError for a track that is another one here than where the work was planned."""
+    from outlap.track.track import Track
+
+    for name, fingerprint in fingerprints.items():
+        if Track.load(name).fingerprint != fingerprint:
+            raise OutlapError(
+                f"track {name}: is another one on machine {os.uname().nodename} than where the work began; "
+                "give all machines the same tracks"
+            )

@@ -1,0 +1,96 @@
+"""Folders of units in an object store, or on any file system that fsspec knows: s3://, gs://, sftp://, file://.
+
+A unit is one archive there, written under another name first, so that there is a whole one or none.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tarfile
+import tempfile
+import uuid
+from pathlib import Path
+
+from outlap.errors import OutlapError
+from outlap.experiments.unit import Unit
+
+
+class Store:
+    """Units that machines without a common folder hand to each other.
+
+    Args:
+        url: where, such as s3://bucket/folder.
+
+    Raises OutlapError for a URL that cannot be used here.
+    """
+
+    def __init__(self, url: str) -> None:
+        from fsspec.core import url_to_fs
+
+        try:
+            self.files, root = url_to_fs(url)
+        except (ImportError, ValueError) as error:  # a protocol without its package, or no protocol at all
+            raise OutlapError(f"--store {url}: cannot be used: {error}") from None
+        self.url, self.root = url, root.rstrip("/")
+
+    def check(self) -> None:
+        """Raises OutlapError where nothing can be written."""
+        probe = f"{self.root}/.{uuid.uuid4().hex}"
+        try:
+            self.files.makedirs(self.root, exist_ok=True)
+            self.files.pipe_file(probe, b"outlap")
+            self.files.rm_file(probe)
+        except Exception as error:  # whatever a file system raises: each has errors of its own
+            raise OutlapError(f"--store {self.url}: cannot be written: {error}; give another --store") from None
+
+    def done(self) -> set[str]:
+        """Keys of the units that are there."""
+        names = (Path(path).name for path in self.files.find(self.root))
+        return {name[-16:-4] for name in names if name.endswith(".tar") and not name.endswith(".part.tar")}
+
+    def put(self, unit: Unit, work: Path) -> None:
+        """Keep a unit that is done."""
+        self._put(unit, work, ".tar")
+        part = self._path(unit, ".part.tar")
+        if self.files.exists(part):
+            self.files.rm_file(part)
+
+    def put_part(self, unit: Unit, work: Path) -> None:
+        """Keep what there is of a unit that is not done yet."""
+        self._put(unit, work, ".part.tar")
+
+    def get(self, unit: Unit, work: Path) -> bool:
+        """Bring a unit that is done, or else what there is of it; whether there was anything."""
+        for suffix in (".tar", ".part.tar"):
+            path = self._path(unit, suffix)
+            if self.files.exists(path):
+                self._get(path, unit.folder(work))
+                return True
+        return False
+
+    def _path(self, unit: Unit, suffix: str) -> str:
+        return f"{self.root}/{unit.kind}/{unit.name}-{unit.key}{suffix}"
+
+    def _put(self, unit: Unit, work: Path, suffix: str) -> None:
+        path = self._path(unit, suffix)
+        beside = f"{path}.{uuid.uuid4().hex}"
+        with tempfile.NamedTemporaryFile(suffix=suffix) as local:
+            with tarfile.open(fileobj=local, mode="w") as archive:
+                archive.add(unit.folder(work), ".", filter=_not_hidden)
+            local.flush()
+            self.files.makedirs(path.rpartition("/")[0], exist_ok=True)
+            self.files.put_file(local.name, beside)
+        self.files.mv(beside, path)
+
+    def _get(self, path: str, folder: Path) -> None:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".fetching-") as beside:
+            with self.files.open(path, "rb") as file, tarfile.open(fileobj=file, mode="r|") as archive:
+                archive.extractall(f"{beside}/unit", filter="data")
+            shutil.rmtree(folder, ignore_errors=True)  # of an earlier session, and behind what was kept since
+            shutil.move(f"{beside}/unit", folder)
+
+
+def _not_hidden(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
+    """Locks and half-written files are left out."""
+    return None if Path(member.name).name.startswith(".") and member.name != "." else member

@@ -1,0 +1,191 @@
+"""Units of work on a real Ray cluster of several nodes: lost nodes, restarts, an object store."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("ray", reason="needs Ray: pip install 'outlap[distributed]'")
+
+import ray
+from ray.cluster_utils import Cluster
+
+from fake_units import Fake, begun, ended
+from outlap.errors import OutlapError
+from outlap.experiments.ray_engine import RayEngine
+from outlap.experiments.runner import Status, run_units
+from outlap.experiments.store import Store
+
+TESTS = str(Path(__file__).parents[1])
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """A head without cores for units, and a node of two."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", TESTS)  # where the workers find their units
+        patch.setenv("RAY_worker_niceness", "0")  # or they wait for the tests beside these
+        made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+        made.add_node(num_cpus=2, num_gpus=1)
+        made.wait_for_nodes()
+        ray.init(made.address, logging_level=logging.WARNING, log_to_driver=False)  # once: processes are used again
+        yield made
+        ray.shutdown()
+        made.shutdown()
+
+
+@pytest.fixture(params=["shared folder", "object store"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
+    return None if request.param == "shared folder" else f"file://{tmp_path / 'store'}"
+
+
+def test_units_wait_for_what_they_need_and_are_done_once(cluster: Cluster, store: str | None, tmp_path: Path):
+    work = tmp_path / "work"
+    first, second = Fake("first", ticks=3), Fake("second", ticks=30)
+    last = Fake("last", before=(first, second))
+    seen: list[Status] = []
+    run_units([first, second, last], work, RayEngine(store=store), on_status=seen.append)
+    assert begun(last, work)[0] >= max(ended(first, work), ended(second, work))
+    assert (seen[-1].done, seen[-1].units) == (3, 3)
+    assert any("second" in status.running for status in seen)
+    run_units([first, second, last], work, RayEngine(store=store))
+    assert [len(begun(unit, work)) for unit in (first, second, last)] == [1, 1, 1]
+
+
+def test_what_fails_stops_only_those_that_need_it(cluster: Cluster, store: str | None, tmp_path: Path):
+    broken, other = Fake("broken", fails=True), Fake("other", ticks=2)
+    after = Fake("after", before=(broken,))
+    with pytest.raises(OutlapError) as error:
+        run_units([broken, after, other], tmp_path / "work", RayEngine(store=store))
+    assert "2 of 3 units of work failed, broken first (ValueError: no luck)" in str(error.value)
+    assert other.is_done(tmp_path / "work")
+
+
+def test_a_lost_node_loses_no_unit_that_is_done_and_its_units_go_on_elsewhere(
+    cluster: Cluster, store: str | None, tmp_path: Path
+):
+    # Short units, and long ones which the node that is killed is in the middle of.
+    work, released = tmp_path / "work", tmp_path / "released"
+    short = [Fake(f"short {number}", ticks=2) for number in range(6)]
+    long = [Fake(f"long {number}", until=str(released)) for number in range(4)]
+    doomed = cluster.add_node(num_cpus=2)
+    cluster.wait_for_nodes()
+    killed: list[float] = []
+
+    def times_begun() -> int:
+        return sum(len(begun(unit, work)) for unit in long)
+
+    def kill(status: Status) -> None:
+        # What is at work with a store is seen nowhere: a while stands for it.
+        at_work = times_begun() == 4 if store is None else True
+        if not killed and status.done == len(short) and len(status.running) == len(long) and at_work:
+            cluster.remove_node(doomed, allow_graceful=False)
+            cluster.add_node(num_cpus=2)
+            killed.append(time.monotonic())
+        elif killed and (times_begun() == 6 if store is None else time.monotonic() - killed[0] > 3.0):
+            released.touch()
+
+    run_units([*short, *long], work, RayEngine(store=store), on_status=kill)
+    assert all(unit.is_done(work) for unit in (*short, *long))
+    assert [len(begun(unit, work)) for unit in short] == [1] * len(short)
+    if store is None:
+        assert sorted(len(begun(unit, work)) for unit in long) == [1, 1, 2, 2]  # those of the lost node once more
+
+
+def test_a_unit_uses_its_share_of_a_gpu(cluster: Cluster, tmp_path: Path):
+    halves = [Fake(f"half {number}", ticks=10, on_gpu=True) for number in range(2)]
+    run_units(halves, tmp_path / "halves", RayEngine(gpu_share=0.5))
+    first, second = (begun(unit, tmp_path / "halves")[0] for unit in halves)
+    assert max(first, second) < min(ended(unit, tmp_path / "halves") for unit in halves)  # both at a time
+    whole = [Fake(f"whole {number}", ticks=10, on_gpu=True) for number in range(2)]
+    run_units(whole, tmp_path / "whole", RayEngine(gpu_share=1.0))
+    spans = sorted((begun(unit, tmp_path / "whole")[0], ended(unit, tmp_path / "whole")) for unit in whole)
+    assert spans[0][1] <= spans[1][0]  # one after the other
+    assert [(unit.folder(tmp_path / "whole") / "gpus").read_text() for unit in whole] == ["0", "0"]
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from fake_units import Fake
+from outlap.experiments.ray_engine import RayEngine
+from outlap.experiments.runner import run_units
+units = [Fake("short"), Fake("long", ticks=80)]
+run_units(units, Path("work"), RayEngine(sys.argv[1], store=sys.argv[2] if len(sys.argv) > 2 else None))
+"""
+
+
+@pytest.mark.parametrize(("by", "with_store"), [(signal.SIGINT, True), (signal.SIGKILL, False)])
+def test_after_ctrl_c_or_a_kill_of_the_driver_the_same_units_go_on(
+    cluster: Cluster, by: signal.Signals, with_store: bool, tmp_path: Path
+):
+    store = f"file://{tmp_path / 'store'}" if with_store else None
+    (tmp_path / "script.py").write_text(SCRIPT)
+    work, short, long = tmp_path / "work", Fake("short"), Fake("long", ticks=80)
+    process = subprocess.Popen(
+        [sys.executable, "script.py", cluster.address, *([store] if store else [])],
+        cwd=tmp_path,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": TESTS},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    wait_for(lambda: short.is_done(work))
+    time.sleep(1.0)
+    process.send_signal(by)
+    process.wait(timeout=60)
+    assert not long.is_done(work)
+    run_units([short, long], work, RayEngine(store=store))
+    assert long.is_done(work)
+    assert len(begun(short, work)) == 1
+    assert len(begun(long, work)) == 2
+
+
+def wait_for(there) -> None:
+    deadline = time.monotonic() + 60.0
+    while not there():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_an_unfinished_unit_is_copied_to_the_store_now_and_then(tmp_path: Path):
+    store, unit = Store(f"file://{tmp_path / 'store'}"), Fake("long", ticks=3)
+    folder = unit.folder(tmp_path / "here")
+    folder.mkdir(parents=True)
+    (folder / "ticks").write_text("2")
+    (folder / ".lock").touch()
+    store.put_part(unit, tmp_path / "here")
+    assert store.done() == set()
+    assert store.get(unit, tmp_path / "there")
+    assert (unit.folder(tmp_path / "there") / "ticks").read_text() == "2"
+    assert not (unit.folder(tmp_path / "there") / ".lock").exists()
+    (folder / "ticks").write_text("3")
+    store.put(unit, tmp_path / "here")
+    assert store.done() == {unit.key}
+    assert store.get(unit, tmp_path / "there")
+    assert (unit.folder(tmp_path / "there") / "ticks").read_text() == "3"
+    assert [path.name for path in (tmp_path / "store").rglob("*") if path.is_file()] == [f"long-{unit.key}.tar"]
+
+
+def test_what_cannot_be_is_said_in_one_line(cluster: Cluster, tmp_path: Path):
+    unit = Fake("first")
+    with pytest.raises(OutlapError, match="--store nowhere://x: cannot be used"):
+        RayEngine(store="nowhere://x")
+    (tmp_path / "file").touch()
+    with pytest.raises(OutlapError, match=r"cannot be written: .*; give another --store"):
+        run_units([unit], tmp_path, RayEngine(store=f"file://{tmp_path / 'file' / 'store'}"))
+    assert not begun(unit, tmp_path)
+
+
+def test_a_machine_that_does_not_have_the_tracks_says_so(cluster: Cluster, tmp_path: Path):
+    unit = Fake("first", on_track="Nightjar")
+    with pytest.raises(OutlapError, match=r"track Nightjar: is another one on machine .* than where the work began"):
+        run_units([unit], tmp_path, RayEngine(tracks={"Nightjar": "0" * 12}))
+    assert not begun(unit, tmp_path)
