@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 pytest.importorskip("ray", reason="needs Ray: pip install 'outlap[distributed]'")
@@ -23,6 +24,9 @@ from outlap.errors import OutlapError
 from outlap.experiments.ray_engine import RayEngine
 from outlap.experiments.runner import Status, run_units
 from outlap.experiments.store import Store
+from outlap.experiments.sweep import SweepConfig
+from outlap.experiments.tune import tune_trials
+from outlap.training.run import load_run
 
 TESTS = str(Path(__file__).parents[1])
 
@@ -189,3 +193,22 @@ def test_a_machine_that_does_not_have_the_tracks_says_so(cluster: Cluster, tmp_p
     with pytest.raises(OutlapError, match=r"track Nightjar: is another one on machine .* than where the work began"):
         run_units([unit], tmp_path, RayEngine(tracks={"Nightjar": "0" * 12}))
     assert not begun(unit, tmp_path)
+
+
+def test_tune_stops_what_falls_behind_and_keeps_the_best(cluster: Cluster, tmp_path: Path):
+    training = {
+        "total_steps": 4096, "num_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 1, "net_arch": [8],
+        "checkpoint_every": 512, "env": {"tracks": ["Nightjar"], "beams": 8, "termination": {"time_limit": 1.0}},
+    }  # fmt: skip
+    sweep = SweepConfig(algorithm="ppo", training=training, search={"learning_rate": (1e-3, 1e-5)})
+    counts: list[int] = []
+    found = tune_trials(sweep, tmp_path, on_trials=lambda done, running: counts.append(done))
+    assert sorted(found["learning_rate"]) == [1e-5, 1e-3]
+    assert found["steps"].iloc[0] == 4096
+    assert not found["stopped_early"].iloc[0]
+    assert counts[-1] == 2
+    best = load_run(tmp_path / "best")
+    assert best.config.learning_rate == found["learning_rate"].iloc[0]
+    assert best.policy_path.is_file()
+    again = tune_trials(sweep, tmp_path)  # nothing is left to do
+    pd.testing.assert_frame_equal(again, found)

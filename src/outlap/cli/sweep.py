@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,7 +56,7 @@ class Sweep(WorkFlags):
         self.do_units(units, folder / "work", "sweeping", self.quiet)
         found = judge(trials, folder / "work")
         best = trials[int(found["trial"].iloc[0])]
-        return _result(found, best.config, folder)
+        return _result(found, best.config, folder, len(best.races))
 
 
 @dataclass(frozen=True)
@@ -86,16 +87,20 @@ class Tune(ClusterFlags):
         self.check_flags()
         sweep = load_config(SweepConfig, self.file)
         folder = self.out or Path("runs") / f"tune-{self.file.stem}"
-        with progress_bar("tuning", 0, "trials", self.quiet) as update:
-            found = tune_trials(
-                sweep, folder, self.address, self.store, self.jobs, self.gpu_share,
-                lambda done, trials: update(done, f"of {trials}"),
-            )  # fmt: skip
+        with progress_bar("tuning", len(sweep.draw()), "trials", self.quiet) as update:
+            try:
+                found = tune_trials(
+                    sweep, folder, self.address, self.store, self.jobs, self.gpu_share,
+                    lambda done, running: update(done, f"{running} running"),
+                )  # fmt: skip
+            except KeyboardInterrupt:
+                print("\nsaved; go on with the same command", file=sys.stderr)
+                raise
         best = sweep.trial_config({name: found[name].iloc[0] for name in sweep.search})
         return _result(found, best, folder)
 
 
-def _result(found: pd.DataFrame, best: TrainingConfig, folder: Path) -> CommandResult:
+def _result(found: pd.DataFrame, best: TrainingConfig, folder: Path, seeds: int = 0) -> CommandResult:
     """Trials as a file and a table, and the configuration of the best."""
     from outlap.evaluation.results import write_rows
 
@@ -108,9 +113,10 @@ def _result(found: pd.DataFrame, best: TrainingConfig, folder: Path) -> CommandR
         from rich.table import Table
 
         table = Table(box=box.SIMPLE_HEAD)
-        for name in found.columns:
-            table.add_column(str(name), justify="right")
-        for row in found.head(SHOWN).itertuples(index=False):
+        shown = found.drop(columns=["progress_low_m", "progress_high_m"]) if seeds == 1 else found
+        for name in shown.columns:
+            table.add_column(str(name), justify="right", overflow="fold")
+        for row in shown.head(SHOWN).itertuples(index=False):
             table.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row))
         console.print(table)
         train = f"outlap train {best.algorithm} --config {path}"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -39,11 +42,11 @@ def tune_trials(
         store: URL of an object store for the trials; None: all machines see `folder` under the same path.
         jobs: trials at a time; 0: as many as there are cores.
         gpu_share: of a GPU, for each trial on one.
-        on_trials: called with the trials that are done and that there are, now and then.
+        on_trials: called with the trials that are done and that run, now and then.
 
     Returns:
-        A row a trial, the best first: the values that are varied, progress_m, crash_rate and mean_speed_mps of its
-        last episodes, and the steps that it came to.
+        A row a trial, the best first, and those that were stopped early behind the others: the values that are
+        varied, progress_m, crash_rate and mean_speed_mps of its last episodes, and the steps that it came to.
 
     Raises OutlapError where Ray is not installed, or all trials failed.
     """
@@ -57,6 +60,7 @@ def tune_trials(
         sweep.trial_config(values)  # now, and not in an hour
     config = sweep.trial_config({})
     total = config.total_steps
+    os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
     began = join_cluster(address)
     try:
         surroundings = Surroundings.here()
@@ -79,22 +83,25 @@ def tune_trials(
                     checkpoint_config=tune.CheckpointConfig(num_to_keep=1),
                 ),
             )  # fmt: skip
-        results = tuner.fit()
+        with contextlib.redirect_stdout(io.StringIO()):  # of Tune's own tables
+            results = tuner.fit()
     finally:
         if began:
             import_ray().shutdown()
-    rows = []
+    rows, checkpoints = [], []
     for result in results:
         metrics = result.metrics or {}
         if SCORE in metrics:
-            found = {name: metrics.get(name) for name in (SCORE, "crash_rate", "mean_speed_mps", STEPS)}
-            rows.append({**dict(result.config or {}), **found})
+            told = {name: metrics[name] for name in (SCORE, "crash_rate", "mean_speed_mps", STEPS)}
+            rows.append({**(result.config or {}), **told, "stopped_early": metrics[STEPS] < total})
+            checkpoints.append(result.checkpoint)
     if not rows:
         raise OutlapError(f"{storage}: no trial came to a result: {next(iter(results.errors), 'no episode ended')}")
-    best = results.get_best_result(SCORE, "max")
-    if best.checkpoint is not None:
-        best.checkpoint.to_directory(folder / "best")
-    return pd.DataFrame(rows).sort_values(SCORE, ascending=False, kind="stable", ignore_index=True)
+    found = pd.DataFrame(rows).sort_values(["stopped_early", SCORE], ascending=[True, False], kind="stable")
+    best = checkpoints[int(found.index[0])]
+    if best is not None:
+        best.to_directory(folder / "best")
+    return found.reset_index(drop=True)
 
 
 def _space(values: Any, grid: bool) -> Any:
@@ -158,6 +165,6 @@ def _watch(on_trials: Callable[[int, int], None] | None) -> Any:
 
         def on_step_end(self, iteration: int, trials: list, **_: Any) -> None:
             if on_trials is not None:
-                on_trials(sum(trial.is_finished() for trial in trials), len(trials))
+                on_trials(sum(t.is_finished() for t in trials), sum(t.status == "RUNNING" for t in trials))
 
     return Watch()
