@@ -15,6 +15,7 @@ class Fake(Unit):
     """Writes when it began and ended, and how often; may fail, and may take long."""
 
     kind = "fakes"
+    learns = False
     before: tuple[Fake, ...] = ()
     fails: bool = False
     dies: bool = False  # takes its process with it

@@ -6,10 +6,13 @@ import dataclasses
 import json
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from outlap.errors import OutlapError
 
 
 @contextmanager
@@ -28,6 +31,38 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def make_folder(folder: Path) -> Path:
+    """Make a folder, before the work that is to fill it. Raises OutlapError where it cannot be written to."""
+    reason = "no permission"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    except OSError as error:
+        reason = error.strerror or str(error)
+    raise OutlapError(f"{folder}: cannot be written: {reason}; give another --out")
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove what writers that were killed have left in a folder and those below it; nothing of writers at work."""
+    for path in folder.rglob(".*.partial*"):
+        found = re.search(r"\.(\d+)\.partial", path.name)
+        if found and not _is_running(int(found[1])):
+            path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    if process == os.getpid() or os.name == "nt":  # where os.kill would end it
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's, or cannot be asked for
+        return True
+    return True
 
 
 def atomic_write(path: str | os.PathLike[str], content: str | bytes) -> Path:

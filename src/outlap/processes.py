@@ -1,10 +1,23 @@
-"""Starting other processes."""
+"""Starting other processes, and ending them early with nothing lost."""
 
 from __future__ import annotations
 
+import _thread
+import multiprocessing
 import os
-from collections.abc import Iterator
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Executor, Future, wait
 from contextlib import contextmanager
+from multiprocessing.context import SpawnContext
+from types import FrameType
+from typing import Any
+
+LOOK = 0.1  # [s] between two looks of a worker whether it is to end
+SAVING = 60.0  # [s] that a worker has for saving its work before it is ended all the same
 
 
 @contextmanager
@@ -20,3 +33,142 @@ def process_environment(**variables: str) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def ctrl_c_kept_away() -> Iterator[None]:
+    """Ctrl-C, which a terminal sends to all, does not reach the processes that are started meanwhile.
+
+    They hear of it from this one, see `Workers`: else those that are still importing end in a traceback each. Here it
+    comes when the block is done.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # handed down, from their first moment on
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class Workers:
+    """What the processes of a pool and the one that started them tell each other."""
+
+    def __init__(self, context: SpawnContext, tasks: int) -> None:
+        self.share = context.RawArray("d", tasks)  # of each task that is done
+        self.begun = context.RawArray("b", tasks)
+        self.stop = context.RawValue("b", 0)  # no lock in any of them that a killed process could hold for ever
+        self._before = set(multiprocessing.active_children())
+
+    @property
+    def initializer_arguments(self) -> tuple[Any, ...]:
+        """Of `start_worker`, with which each process of the pool begins."""
+        return self.share, self.begun, self.stop
+
+    def submit(self, pool: Executor, task: int, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Have a pool do a task."""
+        self.begun[task] = 0
+        with ctrl_c_kept_away():  # the pool may start a process for it
+            return pool.submit(function, *arguments)
+
+    def end(self, running: Collection[tuple[Future[Any], int]]) -> None:
+        """Have those that are at work save what they have, and end all processes of the pool."""
+        self.stop.value = 1
+        # One that has not begun its task has nothing to save, and may be importing for seconds.
+        wait([future for future, task in running if self.begun[task]], SAVING)
+        for process in multiprocessing.active_children():
+            if process not in self._before:
+                process.kill()
+
+
+class _Worker:
+    """This process, if it is one of a pool."""
+
+    share: Any
+    begun: Any
+    stop: Any
+
+    def __init__(self) -> None:
+        self.at_work = False
+        self.changing = threading.Lock()
+
+    def is_to_end(self) -> bool:
+        """Whether nobody wants its work any more for now."""
+        return bool(self.stop.value) or is_orphan()
+
+    def watch(self) -> None:
+        """Interrupt the main thread once it is to end, wherever it is."""
+        main = threading.main_thread().ident
+        while not self.is_to_end() or is_importing(sys._current_frames().get(main or 0)):
+            time.sleep(LOOK)
+        with self.changing:
+            if self.at_work:
+                _thread.interrupt_main()  # and no real signal: those are kept away from this process
+            elif is_orphan():
+                os._exit(1)
+
+
+_worker: _Worker | None = None
+
+
+def start_worker(share: Any, begun: Any, stop: Any) -> None:
+    """The initializer of a pool's processes: light, so that they can be ended while they import what they work with."""
+    global _worker
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    _worker = _Worker()
+    _worker.share, _worker.begun, _worker.stop = share, begun, stop
+    threading.Thread(target=_worker.watch, daemon=True).start()
+
+
+@contextmanager
+def at_work(task: int) -> Iterator[None]:
+    """A worker does a task: KeyboardInterrupt comes wherever it is once all are to end, or nobody waits any more."""
+    worker = _worker
+    if worker is None:  # not in a pool
+        yield
+        return
+    worker.begun[task] = 1
+    with worker.changing:
+        worker.at_work = True
+    try:
+        if worker.is_to_end():
+            raise KeyboardInterrupt
+        yield
+    except KeyboardInterrupt:
+        if is_orphan():
+            os._exit(1)
+        raise
+    finally:
+        with worker.changing:
+            worker.at_work = False
+
+
+def report_share(task: int, share: float) -> None:
+    """A worker tells how much of its task is done."""
+    if _worker is not None:
+        _worker.share[task] = share
+
+
+def import_learning() -> None:
+    """Import what takes longest, before a task begins: a worker can be ended meanwhile."""
+    import stable_baselines3  # noqa: F401 - and PyTorch with it
+
+
+def is_importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported at this frame or further up the stack.
+
+    That is no place for a KeyboardInterrupt: extension modules in C++ abort the process when they meet one there, and
+    others make an ImportError of it.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def is_orphan() -> bool:
+    """Whether the process that started this worker is gone."""
+    parent = multiprocessing.parent_process()
+    return parent is not None and not parent.is_alive()

@@ -135,7 +135,7 @@ def test_after_ctrl_c_or_a_kill_of_the_driver_the_same_units_go_on(
     (tmp_path / "script.py").write_text(SCRIPT)
     work, short, long = tmp_path / "work", Fake("short"), Fake("long", ticks=80)
     process = subprocess.Popen(
-        [sys.executable, "script.py", cluster.address, *([store] if store else [])],
+        [sys.executable, "script.py", str(cluster.address), *([store] if store else [])],
         cwd=tmp_path,
         stderr=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": TESTS},

@@ -81,7 +81,7 @@ def test_after_ctrl_c_or_a_kill_the_same_units_go_on(by: signal.Signals, tmp_pat
         [sys.executable, "script.py"],
         cwd=tmp_path,
         stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     ticks = unit.folder(work) / "ticks"

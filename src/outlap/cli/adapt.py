@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.interrupts import NOTHING_KEPT
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.cli.races import held_out_tracks, unused
@@ -124,7 +128,7 @@ class Adapt:
         rows: list[pd.DataFrame] = []
         updates: list[pd.DataFrame] = []
         total = len(tracks) * (1 + self.seeds * len(self.clip))
-        with progress_bar("adapting", total, "policies", self.quiet) as update:
+        with _kept_whole_or_not_at_all(folder), progress_bar("adapting", total, "policies", self.quiet) as update:
 
             def race(policy: Any, track: Track, method: str, seed: int) -> None:
                 driver = PolicyDriver(policy, scale_observations=races.scale_observations, name=method)
@@ -153,6 +157,20 @@ class Adapt:
         data = {**summary, "folder": folder}
         result = CommandResult(data, lambda console: _print(console, data))
         return with_recordings(result, folder, tracks[0]) if self.record else result
+
+
+@contextmanager
+def _kept_whole_or_not_at_all(folder: Path) -> Iterator[None]:
+    """Empties a folder again if the block does not come to its end: so the same command can begin anew."""
+    try:
+        yield
+    except BaseException as error:
+        shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
+        with suppress(OSError):
+            folder.rmdir()
+        if isinstance(error, KeyboardInterrupt):
+            print(f"\n{NOTHING_KEPT}", file=sys.stderr)
+        raise
 
 
 def _print(console: Console, data: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.interrupts import NOTHING_KEPT
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.cli.races import Flag, RaceFlags, check_positive, held_out_tracks, is_run, unused
@@ -169,9 +171,11 @@ def evaluate_into(
                 update(int(progress.done), f"{progress.finished} finished  {rate:,.0f} steps/s")
 
             rows = evaluate(driver, env, tracks, episodes, seed, num_worlds, show)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             folder.rmdir()  # it is empty
+        if isinstance(error, KeyboardInterrupt):
+            print(f"\n{NOTHING_KEPT}", file=sys.stderr)
         raise
     names = [track.name for track in tracks]
     trained_on = _trained_on(run, names)

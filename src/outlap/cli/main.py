@@ -16,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+from outlap.cli.interrupts import INTERRUPTED, ctrl_c_spares_imports, end_now
 from outlap.cli.output import (
     STANDARD_OUTPUT,
     CommandResult,
@@ -27,8 +28,8 @@ from outlap.errors import OutlapError
 
 SHOWN = "outlap-cli"  # name of the handler that shows what is logged
 # A full disk, a quota, a file system or a folder that cannot be written: no bugs.
-STORAGE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
-DONE, BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED = 0, 2, 130, 141
+STORAGE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.ENOTDIR)
+DONE, BAD_INPUT, OUTPUT_CLOSED = 0, 2, 141
 
 
 class Command(Protocol):
@@ -88,7 +89,11 @@ COMMANDS = (
 
 def run() -> None:
     """The console script."""
-    sys.exit(main())
+    with ctrl_c_spares_imports():
+        code = main()
+    if code == INTERRUPTED:
+        end_now(code)
+    sys.exit(code)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from outlap.cli.interrupts import NOTHING_KEPT
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.config import load_config
@@ -116,7 +118,9 @@ def train_with_progress(config: TrainingConfig, folder: Path, resumed: Run | Non
         try:
             return train(config, folder, resume=resumed, on_progress=on_progress)
         except KeyboardInterrupt:
-            print(f"\nsaved; go on with: outlap train {config.algorithm} --resume {folder}", file=sys.stderr)
+            again = f"outlap train {config.algorithm} --resume {shlex.quote(str(folder))}"
+            begun = (folder / "config.yaml").is_file()
+            print(f"\nsaved; go on with: {again}" if begun else f"\n{NOTHING_KEPT}", file=sys.stderr)
             raise
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from outlap.cli.arguments import check_least
 from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
+from outlap.files import make_folder
 
 if TYPE_CHECKING:
     from outlap.experiments.engine import Engine
@@ -70,6 +71,7 @@ class WorkFlags(ClusterFlags):
         from outlap.experiments.plan import remember_tracks
         from outlap.experiments.runner import run_units
 
+        make_folder(work)
         engine = self.make_engine(remember_tracks({name for unit in units for name in unit.tracks}, work))
         with progress_bar(title, 1000, "‰", quiet) as update:
 

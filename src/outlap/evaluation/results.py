@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from outlap.errors import OutlapError
-from outlap.files import atomic_write, to_json
+from outlap.files import atomic_write, make_folder, to_json
 
 ROWS, SUMMARY, RECORD = "episodes.parquet", "summary.json", "evaluation.json"
 
@@ -21,14 +20,9 @@ def prepare_folder(folder: Path) -> None:
 
     Raises OutlapError where there is something in it already, or nothing can be written.
     """
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise OutlapError(f"{folder}: is there already; must be an empty or a new folder")
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutlapError(f"{folder}: cannot be made: {error.strerror}") from None
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutlapError(f"{folder}: cannot be written to; give another folder")
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise OutlapError(f"{folder}: is there already; must be an empty or a new folder")
+    make_folder(folder)
 
 
 def save_results(folder: Path, rows: pd.DataFrame, summary: Mapping[str, Any], record: Mapping[str, Any]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -12,13 +11,13 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from filelock import FileLock
 
 from outlap.experiments.unit import DONE, Report, Unit, done_record
-from outlap.files import atomic_write, to_json
-from outlap.processes import process_environment
+from outlap.files import atomic_write, remove_partials, to_json
+from outlap.processes import Workers, at_work, import_learning, process_environment, report_share, start_worker
 
 SECONDS = "seconds.txt"  # how long an unfinished unit has taken so far
 NOTE_EVERY = 10.0  # [s] between two notes of that
@@ -90,20 +89,20 @@ class LocalEngine:
 
     def open(self, units: Sequence[Unit], work: Path) -> None:
         self._work = work
-        context = multiprocessing.get_context("spawn")
-        self._context, self._shares, self._stop = context, context.Array("d", len(units)), context.Event()
+        self._context = multiprocessing.get_context("spawn")
+        self._workers = Workers(self._context, len(units))
         self._numbers = {unit.key: number for number, unit in enumerate(units)}
         self._resources.enter_context(process_environment(**ONE_THREAD))
         self._pool = self._new_pool()
         self._resources.callback(lambda: self._pool.shutdown(wait=True))
-        self._resources.callback(self._stop.set)
 
     def _new_pool(self) -> ProcessPoolExecutor:
-        shared = self._shares, self._stop
-        return ProcessPoolExecutor(self.slots, mp_context=self._context, initializer=_start_worker, initargs=shared)
+        shared = self._workers.initializer_arguments
+        return ProcessPoolExecutor(self.slots, mp_context=self._context, initializer=start_worker, initargs=shared)
 
     def submit(self, unit: Unit) -> None:
-        self._running[self._pool.submit(_do_in_worker, unit, self._work, self._numbers[unit.key])] = unit
+        number = self._numbers[unit.key]
+        self._running[self._workers.submit(self._pool, number, _do_in_worker, unit, self._work, number)] = unit
 
     def wait(self, timeout: float) -> list[Outcome]:
         if not self._running and self._again:
@@ -129,9 +128,11 @@ class LocalEngine:
         return outcomes
 
     def shares(self) -> Mapping[str, float]:
-        return {unit.key: self._shares[self._numbers[unit.key]] for unit in self._running.values()}
+        return {unit.key: self._workers.share[self._numbers[unit.key]] for unit in self._running.values()}
 
     def close(self) -> None:
+        if self._running:  # after an error or Ctrl-C
+            self._workers.end([(future, self._numbers[unit.key]) for future, unit in self._running.items()])
         self._resources.close()
 
 
@@ -144,6 +145,7 @@ def do_unit(unit: Unit, work: Path, report: Report) -> float:
     folder.mkdir(parents=True, exist_ok=True)
     # Whoever was at work here before, and has lost its parent, may still be saving.
     with FileLock(folder / ".lock"):
+        remove_partials(folder)
         before, begun = _seconds_before(folder), time.monotonic()
         noted = begun
 
@@ -169,31 +171,8 @@ def _seconds_before(folder: Path) -> float:
         return 0.0
 
 
-_shares: Any = None  # of every unit, shared by the processes of a pool
-_stop: Any = None  # set when all units are to end, shared likewise
-
-
-def _start_worker(shares: Any, stop: Any) -> None:
-    global _shares, _stop
-    _shares, _stop = shares, stop
-    # Ctrl-C reaches every process of a terminal; workers hear of it from the one that started them.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def _do_in_worker(unit: Unit, work: Path, number: int) -> float:
-    parent = multiprocessing.parent_process()
-
-    def orphaned() -> bool:
-        return parent is not None and not parent.is_alive()
-
-    def report(share: float) -> None:
-        _shares[number] = share
-        if orphaned() or _stop.is_set():
-            raise KeyboardInterrupt  # nobody waits for this any more: save and go
-
-    try:
-        return do_unit(unit, work, report)
-    except KeyboardInterrupt:
-        if orphaned():
-            os._exit(1)
-        raise
+    if unit.learns:
+        import_learning()
+    with at_work(number):
+        return do_unit(unit, work, lambda share: report_share(number, share))

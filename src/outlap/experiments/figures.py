@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -220,6 +221,8 @@ def read_learning(folder: Path) -> pd.DataFrame:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     names = {"episode_return": "race/episode_return", "crash_rate": "race/crash_rate"}
+    # Of a run that was stopped it would tell that what comes again is passed over.
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)
     log = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0})
     log.Reload()
     if not set(names.values()) <= set(log.Tags()["scalars"]):

@@ -69,6 +69,7 @@ class PopulationUnit(Unit):
     """The opponents that passed their verification, as a population."""
 
     kind = "populations"
+    learns = False
     opponents: tuple[OpponentUnit, ...]
 
     @property

@@ -143,24 +143,23 @@ def judge(trials: Sequence[Trial], work: Path) -> pd.DataFrame:
     Columns: trial, every field that is varied, progress_m, progress_low_m and progress_high_m (the worst and the best
     seed), crash_rate, mean_speed_mps.
     """
-    rows = []
+    found = []
     for trial in trials:
-        raced = pd.concat(
-            [pd.read_parquet(race.folder(work) / ROWS) for race in trial.races], keys=range(len(trial.races))
-        )
-        by_seed = raced["progress_m"].groupby(level=0).mean()
-        rows.append(
+        raced = [pd.read_parquet(race.folder(work) / ROWS) for race in trial.races]
+        progress = np.array([rows["progress_m"].to_numpy().mean() for rows in raced])  # of each seed
+        everything = pd.concat(raced)
+        found.append(
             {
                 "trial": trial.number,
                 **trial.values,
-                "progress_m": float(by_seed.mean()),
-                "progress_low_m": float(by_seed.min()),
-                "progress_high_m": float(by_seed.max()),
-                "crash_rate": float((raced["outcome"] == CRASH).mean()),
-                "mean_speed_mps": float(raced["mean_speed_mps"].mean()),
+                "progress_m": progress.mean(),
+                "progress_low_m": progress.min(),
+                "progress_high_m": progress.max(),
+                "crash_rate": np.mean(everything["outcome"].to_numpy() == CRASH),
+                "mean_speed_mps": everything["mean_speed_mps"].to_numpy().mean(),
             }
         )
-    return pd.DataFrame(rows).sort_values("progress_m", ascending=False, kind="stable", ignore_index=True)
+    return pd.DataFrame(found).sort_values("progress_m", ascending=False, kind="stable", ignore_index=True)
 
 
 def _range(name: str, value: Any) -> Any:

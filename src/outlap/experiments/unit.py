@@ -27,6 +27,8 @@ class Unit:
 
     name: str
     kind: ClassVar[str]
+    # Whether it needs PyTorch, which is imported before it begins: a process can be ended at once meanwhile.
+    learns: ClassVar[bool] = True
 
     @cached_property
     def needs(self) -> tuple[Unit, ...]:

@@ -112,13 +112,13 @@ def create_run(folder: Path, config: TrainingConfig) -> Run:
     """Make a run folder. Raises OutlapError if there is one already, or it cannot be written."""
     if (folder / "config.yaml").exists():
         raise OutlapError(f"{folder}: holds a run already; resume it with --resume {folder}, or give another --out")
+    run = Run(folder, config)
     try:
         (folder / "checkpoints").mkdir(parents=True, exist_ok=True)
-        save_config(config, folder / "config.yaml")
+        run.write_record(**provenance(), seed=config.seed, finished=False)
+        save_config(config, folder / "config.yaml")  # the last: what has it is a whole run
     except OSError as error:
         raise OutlapError(f"{folder}: cannot be written: {error.strerror}; give another --out") from None
-    run = Run(folder, config)
-    run.write_record(**provenance(), seed=config.seed, finished=False)
     return run
 
 

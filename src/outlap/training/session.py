@@ -20,6 +20,7 @@ from outlap.envs.race_config import RaceConfig
 from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
+from outlap.files import remove_partials
 from outlap.training.run import Run, create_run, save_checkpoint
 
 if TYPE_CHECKING:
@@ -138,6 +139,7 @@ def train(
     run = resume or create_run(folder, config)
     if resume:
         run.begin_session()
+        remove_partials(run.folder)
         model = _newest_model(run, environment, config) or config.make_model(environment)
     assert model is not None
     run.write_record(tracks={track.name: track.fingerprint for track in environment.env.tasks.tracks})
@@ -145,6 +147,8 @@ def train(
     environment.env.training_steps = begun_at
     # A resumed run must not race the episodes again that it has raced before.
     environment.seed(int(np.random.SeedSequence([config.seed, begun_at]).generate_state(1)[0]))
+    if resume:
+        _forget_curve_after(begun_at, run.folder / "tensorboard")
     model.set_logger(configure(str(run.folder / "tensorboard"), ["tensorboard"]))
     clock = Stopwatch(float(run.record().get("seconds", 0.0)) if begun_at else 0.0)
     try:
@@ -171,6 +175,13 @@ def train(
         compile_seconds=environment.env.race.simulator.compile_seconds,
     )
     return run
+
+
+def _forget_curve_after(steps: int, folder: Path) -> None:
+    """Have readers of a log pass over what was noted beyond a checkpoint that a run goes on from: it comes again."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    SummaryWriter(str(folder), purge_step=steps + 1).close()
 
 
 def _save(run: Run, model: Any, clock: Stopwatch) -> None:
