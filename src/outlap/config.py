@@ -6,6 +6,7 @@ import difflib
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -95,6 +96,29 @@ In a file `0.8` or `{min: 0.5, max: 1.1}`; as a flag `--vehicle.mu 0.8` or `--ve
 """
 
 
+@dataclass(frozen=True)
+class Interval:
+    """Where both ends of a `Number` must lie; called with one, it lets it through or says why not."""
+
+    above: float | None = None
+    at_least: float | None = None
+    below: float | None = None
+    at_most: float | None = None
+
+    def __call__(self, value: float | tuple[float, float]) -> float | tuple[float, float]:
+        low, high = bounds(value)
+        limits = [
+            (">", self.above, lambda limit: low > limit),
+            (">=", self.at_least, lambda limit: low >= limit),
+            ("<", self.below, lambda limit: high < limit),
+            ("<=", self.at_most, lambda limit: high <= limit),
+        ]
+        set_ones = [(f"{sign} {limit}", holds(limit)) for sign, limit, holds in limits if limit is not None]
+        if not all(held for _, held in set_ones):
+            raise ValueError("must be " + " and ".join(rule for rule, _ in set_ones))
+        return value
+
+
 def bounded(
     *,
     above: float | None = None,
@@ -103,22 +127,19 @@ def bounded(
     at_most: float | None = None,
 ) -> AfterValidator:
     """A limit for a `Number`, on both ends where it is a range: `mu: Annotated[Number, bounded(above=0)]`."""
-    limits = [
-        (f"> {above}", lambda low, high: low > above) if above is not None else None,
-        (f">= {at_least}", lambda low, high: low >= at_least) if at_least is not None else None,
-        (f"< {below}", lambda low, high: high < below) if below is not None else None,
-        (f"<= {at_most}", lambda low, high: high <= at_most) if at_most is not None else None,
-    ]
-    checks = [limit for limit in limits if limit is not None]
-    rule = "must be " + " and ".join(text for text, _ in checks)
+    return AfterValidator(Interval(above, at_least, below, at_most))
 
-    def check(value: float | tuple[float, float]) -> float | tuple[float, float]:
-        low, high = bounds(value)
-        if not all(holds(low, high) for _, holds in checks):
-            raise ValueError(rule)
-        return value
 
-    return AfterValidator(check)
+def widest(cls: type[BaseModel], field: str) -> tuple[float, float]:
+    """The ends of what a field of type `Number` may be; infinite where it has no limit."""
+    low, high = -math.inf, math.inf
+    for each in cls.model_fields[field].metadata:
+        if isinstance(each, AfterValidator) and isinstance(each.func, Interval):
+            lows = (low, each.func.above, each.func.at_least)
+            highs = (high, each.func.below, each.func.at_most)
+            low = max(limit for limit in lows if limit is not None)
+            high = min(limit for limit in highs if limit is not None)
+    return low, high
 
 
 def bounds(number: float | tuple[float, float]) -> tuple[float, float]:

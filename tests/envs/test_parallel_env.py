@@ -113,8 +113,11 @@ def test_every_car_is_told_its_place_and_rewarded_for_overtaking(big_circle):
     ("actions", "message"),
     [
         ({"car_0": np.zeros(2)}, "none for car_1"),
-        ({"car_0": np.zeros(2), "car_1": np.zeros(3)}, r"that of car_1 is array.*must be \(2,\)"),
-        ({"car_0": np.array([0.0, np.nan]), "car_1": np.zeros(2)}, "that of car_0 .* must be .* finite"),
+        ({"car_0": np.zeros(2), "car_1": np.zeros(3)}, r"car_1: given actions of shape \(3,\); must be \(2,\)"),
+        (
+            {"car_0": np.array([0.0, np.nan]), "car_1": np.zeros(2)},
+            r"car_0: given the action \[0\.0, nan\]; must be finite",
+        ),
     ],
 )
 def test_wrong_actions_are_named(ellipse, actions, message):

@@ -184,7 +184,7 @@ def test_the_episode_that_ended_has_its_own_opponents_in_its_summary(circle) -> 
         (np.full((32, 2), np.nan), r"driver broken: gave the action \[nan, nan\]; must be finite"),
         (np.zeros((32, 3)), r"driver broken: gave actions of shape \(32, 3\); must be \(32, 2\)"),
         (np.zeros(2), r"driver broken: gave actions of shape \(2,\); must be \(32, 2\)"),
-        (None, r"driver broken: gave actions of shape \(\); must be \(32, 2\)"),
+        (None, r"driver broken: gave None; must be numbers \(32, 2\)"),
     ],
     ids=["nan", "three numbers", "one car", "nothing"],
 )

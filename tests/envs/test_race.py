@@ -139,3 +139,12 @@ def test_the_order_at_the_start_is_the_order_on_the_track(big_circle):
     _, rewards, _, _, info = env.step(np.tile([0.0, -1.0], (60, 1)))
     np.testing.assert_array_equal(rewards, 0.0)
     np.testing.assert_array_equal(info["overtakes"] + info["places_lost"], 0)
+
+
+def test_an_opponent_that_stands_in_a_car_without_reverse_stays_where_it_is(circle):
+    env = duel(circle, opponent_speed=0.0, vehicle={"v_min": 0.0})
+    env.reset(seed=0)
+    before = env.race.worlds.state[:, 1].copy()
+    for _ in range(5):
+        env.step(np.zeros((1, 2)))
+    np.testing.assert_array_equal(env.race.worlds.state[:, 1, :2], before[:, :2])

@@ -342,10 +342,10 @@ def test_stepping_before_a_reset_is_refused(ellipse):
         (np.zeros(2), "shape"),
         (np.zeros((3, 2)), "shape"),
         (np.zeros((2, 3)), "shape"),
-        ([[0.0, 0.0], [np.nan, 0.0]], "world 1.*finite"),
-        ([[0.0, np.inf], [0.0, 0.0]], "world 0.*finite"),
-        ([["left", 0.0], [0.0, 0.0]], "actions"),
-        (None, "actions"),
+        ([[0.0, 0.0], [np.nan, 0.0]], "finite .row 1"),
+        ([[0.0, np.inf], [0.0, 0.0]], "finite .row 0"),
+        ([["left", 0.0], [0.0, 0.0]], "given .*left.*numbers"),
+        (None, "given None; must be numbers"),
     ],
 )
 def test_wrong_actions_are_refused_and_change_nothing(ellipse, actions, words):

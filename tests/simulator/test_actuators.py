@@ -97,6 +97,12 @@ def test_speed_controller_has_the_gyms_four_gains(speed, target, expected):
     assert acceleration(target, speed, row_with()) == pytest.approx(expected, rel=1e-6)
 
 
+def test_a_car_that_can_neither_drive_nor_reverse_stands():
+    row = row_with()
+    row[[column.V_MIN, column.V_MAX]] = 0.0
+    assert [acceleration(target, 0.0, row) for target in (-1.0, 0.0, 1.0)] == [0.0, 0.0, 0.0]
+
+
 def test_a_car_without_reverse_stops_smoothly():
     row = row_with()
     row[column.V_MIN] = 0.0

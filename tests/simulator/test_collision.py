@@ -229,6 +229,18 @@ def test_a_wall_one_pixel_thick_stops_a_car_that_slides_into_it_sideways(timeste
     assert (side * (wall - sim.worlds.state[:, 0, Y]) >= -1e-5).all()
 
 
+def test_a_body_wider_than_long_stops_with_its_middle_before_the_wall():
+    occupancy = np.zeros((200, 200), bool)
+    occupancy[:, 150:] = True
+    params = CAR.copy()
+    params[[LENGTH, WIDTH]] = 0.05, 1.0
+    poses = [[[6.0 + 0.007 * k, 5.0, 0.0]] for k in range(60)]
+    sim = place(hall(occupancy), poses, speed=20.0, params=params, beams=0)
+    drive(sim, 0.2, 20.0)
+    assert (sim.worlds.contact == HIT_WALL).all()
+    assert (sim.worlds.state[..., X] < 7.5).all()
+
+
 @pytest.mark.parametrize("timestep", [0.01, 0.05])
 def test_a_single_pixel_stops_a_car(timestep):
     occupancy = np.zeros((80, 400), bool)

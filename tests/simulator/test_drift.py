@@ -116,6 +116,18 @@ def test_standing_start_reaches_the_speed_that_the_engine_gives():
     assert state[3] == pytest.approx(6.0 * row[column.M] / (row[column.M] + wheels), rel=0.02)
 
 
+def test_no_tyre_drives_a_car_faster_than_its_motor():
+    """Coefficients far outside the table, whose combined slip gives forces many times the friction."""
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        row = small_row()
+        row[column.P_KX1], row[column.R_CX1], row[column.P_DY1] = 1.7, rng.uniform(-1e3, 1e3), rng.uniform(0.01, 0.6)
+        state = rolling(rng.uniform(0.5, 20.0), row)
+        for _ in range(60):
+            state = integrate(DRIFT, RK4, state, rng.uniform(-3.2, 3.2), rng.uniform(-9.5, 9.5), 0.01, row)
+            assert 1.2 * row[column.V_MIN] <= state[3] <= 1.2 * row[column.V_MAX]
+
+
 def test_internal_steps_follow_the_stiffness():
     row = small_row()
     counts = [drift_substeps(RK4, rolling(speed, row), 0.0, 0.01, row) for speed in (0.3, 1.0, 3.0, 20.0)]

@@ -52,6 +52,8 @@ def sim() -> Simulator:
         ("tracks", [0]), ("tracks", [0, 1]), ("tracks", [-1, 0]),
         ("params", np.tile(CAR, (2, 1))), ("params", np.tile(CAR[:-1], (2, 2, 1))),
         ("params", changed("params", (1, 0, LR), np.nan)), ("params", changed("params", (0, 1, MAX_RANGE), np.inf)),
+        ("params", changed("params", (0, 1, LR), 0.0)), ("params", np.zeros((2, 2, len(CAR)))),
+        ("params", changed("params", (0, 0, MAX_RANGE), 1e30)),
         ("params", changed("params", (0, 0, STEER_DELAY), 0.02)),
         ("params", changed("params", (0, 0, SPEED_DELAY), 0.01)),
         ("params", changed("params", (0, 0, STEER_DELAY), np.nan)),
@@ -75,14 +77,20 @@ def test_a_reset_of_no_world_is_fine(sim):
     assert_same(before, snapshot(sim))
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_commands_that_are_not_finite_are_refused_by_world_and_car(sim, value):
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1.1e6])
+def test_commands_beyond_all_measure_are_refused_by_world_and_car(sim, value):
     before = snapshot(sim)
     commands = np.zeros((2, 2, 2))
     commands[1, 0, 1] = value
     with pytest.raises(OutlapError, match=r"commands.*car 0 in world 1"):
         sim.step(commands)
     assert_same(before, snapshot(sim))
+
+
+@pytest.mark.parametrize("commands", [np.full((2, 2, 2), None), np.full((2, 2, 2), "1"), np.zeros((2, 2, 2), complex)])
+def test_commands_that_are_no_numbers_are_refused(sim, commands):
+    with pytest.raises(OutlapError, match=r"commands is of type .*; they must be numbers"):
+        sim.step(commands)
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (2, 2, 3), (1, 2, 2), (2, 1, 2), (0,)])

@@ -34,7 +34,7 @@ def test_columns_follow_the_fields():
 
 
 def test_bounds_put_every_value_in_its_own_column():
-    numbers = {name: 0.001 * (number + 1) for number, name in enumerate(field_order())}
+    numbers = {name: 0.01 * (number + 1) for number, name in enumerate(field_order())}
     for name in ("steer_min", "v_min", "p_ky1"):
         numbers[name] *= -1
     ranges = {name: tuple(sorted((value, 1.5 * value))) for name, value in numbers.items()}
@@ -71,6 +71,16 @@ def test_presets_are_the_published_cars():
     [
         (VehicleParams, "m", 0.0),
         (VehicleParams, "m", -3.74),
+        (VehicleParams, "m", 1e-300),
+        (VehicleParams, "mu", 1e300),
+        (VehicleParams, "lr", (1e-5, 0.2)),
+        (VehicleParams, "width", 1e-6),
+        (VehicleParams, "steer_max", 1e-6),
+        (VehicleParams, "v_max", 1e5),
+        (PacejkaTyre, "r_bx1", -1e30),
+        (ActuatorParams, "steer_gain", 1e30),
+        (LidarParams, "mount_x", 1e30),
+        (LidarParams, "bias", -1e39),
         (VehicleParams, "mu", (0.0, 1.0)),
         (VehicleParams, "mu", (1.0, 0.5)),
         (VehicleParams, "mu", float("nan")),
@@ -110,5 +120,5 @@ def test_a_car_survives_a_file(tmp_path):
 def test_a_wrong_file_says_where_and_why(tmp_path):
     path = tmp_path / "car.yaml"
     path.write_text("mu: -1\n")
-    with pytest.raises(OutlapError, match=r"car\.yaml: mu .*> 0"):
+    with pytest.raises(OutlapError, match=r"car\.yaml: mu .*>= 0\.01"):
         load_config(VehicleParams, path)

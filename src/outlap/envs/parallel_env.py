@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from pettingzoo import ParallelEnv
 
+from outlap.drivers.driver import checked_actions
 from outlap.envs.race_vector_env import CONTACTS, RaceVectorEnv
 from outlap.envs.terminations import CRASH, RUNNING
 from outlap.errors import OutlapError
@@ -94,10 +95,7 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         for agent in self.agents:
             if agent not in actions:
                 raise OutlapError(f"actions: none for {agent}; must have one for each of {', '.join(self.agents)}")
-            action = np.asarray(actions[agent])
-            if action.shape != (2,) or not np.isfinite(action).all():
-                raise OutlapError(f"actions: that of {agent} is {action!r:.60}; must be (2,) finite numbers")
-            everyone[0, self._cars[agent]] = np.clip(action, -1.0, 1.0)
+            everyone[0, self._cars[agent]] = checked_actions(actions[agent], (2,), f"{agent}: given")
         return everyone
 
     def _observe(self) -> dict[str, dict[str, np.ndarray]]:

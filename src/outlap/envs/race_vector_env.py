@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from outlap.config import bounds, validate
-from outlap.drivers.driver import Driver
+from outlap.drivers.driver import Driver, checked_actions
 from outlap.drivers.find import Named, driver_name, find_drivers
 from outlap.envs.actions import commands, speed_spans
 from outlap.envs.observations import observation_space, observe
@@ -303,17 +303,8 @@ class RaceVectorEnv(VectorEnv):
 
     def _all_actions(self, actions: np.ndarray) -> np.ndarray:
         """The ego's actions, checked and clipped, with those of the opponents: (worlds, cars, 2)."""
-        try:
-            actions = np.asarray(actions, np.float32)
-        except (TypeError, ValueError):
-            raise OutlapError(f"actions are {actions!r:.60}; they must be numbers ({self.num_envs}, 2)") from None
-        if actions.shape != (self.num_envs, 2):
-            raise OutlapError(f"actions have shape {actions.shape}; they must be ({self.num_envs}, 2)")
-        if not np.isfinite(actions).all():
-            world = int(np.argwhere(~np.isfinite(actions))[0, 0])
-            raise OutlapError(f"actions: that of world {world} is {actions[world].tolist()}; it must be finite")
         everyone = np.empty((self.num_envs, self.config.num_cars, 2), np.float32)
-        everyone[:, EGO] = np.clip(actions, -1.0, 1.0)
+        everyone[:, EGO] = checked_actions(actions, (self.num_envs, 2), "step: given")
         if self.config.num_cars > 1 and not self._over.any():
             if self._opponents is None:
                 raise OutlapError("opponents: none given; step drives the first car only, advance all of them")

@@ -72,6 +72,8 @@ def acceleration(target_speed, speed, p):
     would get an unbounded gain: -v_min counts as at least v_max / 10.
     """
     error = target_speed - speed
+    if error == 0.0:  # a car that can neither drive nor reverse has no gain
+        return 0.0
     gain = 1.0 * p[SPEED_GAIN]
     if speed <= 0.0:
         gain *= 0.2

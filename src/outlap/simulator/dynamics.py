@@ -27,7 +27,7 @@ from outlap.simulator.bicycle import (
     wrap_angle,
 )
 from outlap.simulator.drift import BLEND_SPEED, RELAXATION_TIME, drift, drift_substeps, drift_weight
-from outlap.simulator.vehicle import V_MAX, WHEEL_RADIUS
+from outlap.simulator.vehicle import V_MAX, V_MIN, WHEEL_RADIUS
 
 __all__ = [
     "DRIFT",
@@ -49,7 +49,7 @@ KINEMATIC, SINGLE_TRACK, DRIFT = 0, 1, 2
 
 # What no car exceeds, and a spinning one may under linear tyres or far outside a tyre's table.
 HIGHEST_YAW_RATE = 50.0  # [rad/s] eight turns a second
-HIGHEST_WHEEL_SPEED = 1.2  # times v_max / wheel_radius: the motor's limit under wheelspin
+HIGHEST_WHEEL_SPEED = 1.2  # times v_max / wheel_radius: the motor's limit under wheelspin, and so the car's
 
 
 @njit(cache=True, error_model="numpy")
@@ -71,8 +71,9 @@ def integrate(model, integrator, state, steer_rate, acceleration, dt, p):
         p: the car's parameter row.
 
     Returns:
-        The next state: yaw and slip in (-pi, pi]. Where tyres slip, yaw rate is within 50 rad/s, and under
-        SINGLE_TRACK slip within pi / 2: whatever the car and the driver, the state stays finite.
+        The next state: yaw and slip in (-pi, pi]. Where tyres slip, yaw rate is within 50 rad/s; under SINGLE_TRACK
+        slip is within pi / 2, under DRIFT speed within 1.2 times v_min … v_max. Whatever the car and the driver, the
+        state stays finite.
     """
     if model == DRIFT:
         return _substepped_drift(integrator, state, steer_rate, acceleration, dt, p)
@@ -97,13 +98,16 @@ def _substepped_drift(integrator, state, steer_rate, acceleration, dt, p):
     """A drift step, cut into as many equal ones as its stiff wheels and tyres need at this speed."""
     count = drift_substeps(integrator, state, acceleration, dt, p)
     h = dt / count
-    fastest_wheel = HIGHEST_WHEEL_SPEED * p[V_MAX] / p[WHEEL_RADIUS]
+    fastest = HIGHEST_WHEEL_SPEED * p[V_MAX]
+    fastest_back = min(HIGHEST_WHEEL_SPEED * p[V_MIN], -BLEND_SPEED)  # below which a spin ends in reverse
+    fastest_wheel = fastest / p[WHEEL_RADIUS]
     x, y, steer, speed, yaw, yaw_rate, slip, front, rear = state
     for _ in range(count):
         x, y, steer, speed, yaw, yaw_rate, slip, front, rear = _drift_step(
             integrator, (x, y, steer, speed, yaw, yaw_rate, slip, front, rear),
             steer_rate, acceleration, h, p,
         )  # fmt: skip
+        speed = min(max(speed, fastest_back), fastest)
         yaw = wrap_angle(yaw)
         slip = wrap_angle(slip)
         yaw_rate = min(max(yaw_rate, -HIGHEST_YAW_RATE), HIGHEST_YAW_RATE)

@@ -116,14 +116,15 @@ def _drive(constants, worlds, w, c, steer_command, speed_command):
 def _collide(atlas, worlds, w):
     """Find contacts on the way of the last physics step and park the cars that made one."""
     cars = worlds.state.shape[1]
-    # Poses in between are tested too, no further apart than half a car's width: then nothing is jumped over,
-    # and a car that slides sideways is parked before its middle is in the wall.
+    # Poses in between are tested too, no further apart than half of a car's shorter side: then nothing is jumped
+    # over, and a car is parked before its middle is in the wall, however it slides.
     checks = 1
     for c in range(cars):
         dx = worlds.state[w, c, column.X] - worlds.before[w, c, 0]
         dy = worlds.state[w, c, column.Y] - worlds.before[w, c, 1]
         moved = math.sqrt(dx * dx + dy * dy)
-        checks = max(checks, math.ceil(2.0 * moved / worlds.params[w, c, WIDTH]))
+        shorter = min(worlds.params[w, c, LENGTH], worlds.params[w, c, WIDTH])
+        checks = max(checks, math.ceil(2.0 * moved / shorter))
     track = worlds.track[w]
     for check in range(1, checks + 1):
         share = check / checks

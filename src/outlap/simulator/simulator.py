@@ -16,13 +16,14 @@ from outlap.simulator.collision import REMOVED
 from outlap.simulator.dynamics import DRIFT, EULER, KINEMATIC, RK4, SINGLE_TRACK
 from outlap.simulator.lidar import beam_directions
 from outlap.simulator.state import N_STATE
-from outlap.simulator.vehicle import N_PARAMS, SPEED_DELAY, STEER_DELAY
+from outlap.simulator.vehicle import N_PARAMS, SPEED_DELAY, STEER_DELAY, accepted_rows, parameter_names
 from outlap.track.track import Track
 
 MODELS = {"kinematic": KINEMATIC, "single_track": SINGLE_TRACK, "drift": DRIFT}
 INTEGRATORS = {"euler": EULER, "rk4": RK4}
 MAX_BEAMS = 1080
 MAX_DELAY_STEPS = 1000
+MAX_COMMAND = 1e6  # beyond any stop and any speed, and far from where single precision ends
 
 
 class SimulatorConfig(Config):
@@ -123,7 +124,7 @@ class Simulator:
             which: (n,) indices of worlds.
             keys: uint64 (n,), the key of each world's sensor noise.
             tracks: (n,) positions in `tracks`.
-            params: (n, cars, N_PARAMS), see `vehicle.parameter_bounds`.
+            params: (n, cars, N_PARAMS), see `vehicle.parameter_bounds`; within `vehicle.accepted_rows`.
             starts: (n, cars, 4) arc length [m], offset to the left [m], heading error [rad], speed [m/s].
         """
         which = np.asarray(which)
@@ -146,7 +147,7 @@ class Simulator:
         _check(len(set(worlds)) == n, "which", which, "each world may be named once")
         numbers = tracks.tolist()
         _check(min(numbers) >= 0 and max(numbers) < len(self.tracks), "tracks", tracks, "no such track")
-        _check(bool(np.isfinite(params).all()), "params", "NaN or infinity", "it must be finite")
+        _check_rows(params)
         _check(bool(np.isfinite(starts).all()), "starts", "NaN or infinity", "it must be finite")
         slots = self.worlds.delayed.shape[2]
         late = max(params[..., STEER_DELAY].max(), params[..., SPEED_DELAY].max()) / self.config.timestep
@@ -165,16 +166,18 @@ class Simulator:
             commands: (worlds, cars, 2) steering angle [rad], left positive, and speed [m/s].
             repeats: physics steps.
 
-        Raises OutlapError where a command is not finite or a world was never reset.
+        Raises OutlapError where a command is not a number within 1e6 or a world was never reset.
         """
         commands = np.asarray(commands)
+        _check(commands.dtype.kind in "fiub", "commands", f"of type {commands.dtype}", "they must be numbers")
         _check_shape("commands", commands, self._commands.shape)
         _check(repeats >= 1, "repeats", repeats, "it must be at least 1")
-        if not np.isfinite(commands).all():
-            world, car, _ = np.argwhere(~np.isfinite(commands))[0]
+        sane = np.abs(commands) <= MAX_COMMAND  # which NaN is not
+        if not sane.all():
+            world, car, _ = np.argwhere(~sane)[0]
             raise OutlapError(
                 f"commands: that of car {car} in world {world} is {commands[world, car].tolist()}; "
-                "a steering angle [rad] and a speed [m/s], both finite, are needed"
+                f"a steering angle [rad] and a speed [m/s], both within {MAX_COMMAND:g}, are needed"
             )
         if not self._started.all():
             raise OutlapError(f"world {np.argmin(self._started)} was never reset; call reset before step")
@@ -213,3 +216,16 @@ def _check(holds: bool, name: str, value: object, remedy: str) -> None:
 def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise OutlapError(f"simulator: {name} has shape {array.shape}; it must be {shape}")
+
+
+def _check_rows(params: np.ndarray) -> None:
+    """Refuse what no configuration gives: a car without mass or wheelbase is nowhere, and its scan reads anywhere."""
+    low, high = accepted_rows()
+    accepted = (params >= low) & (params <= high)
+    if not accepted.all():
+        world, car, column = np.argwhere(~accepted)[0]
+        name, value = parameter_names()[column], params[world, car, column]
+        raise OutlapError(
+            f"simulator: params: {name} of car {car} in row {world} is {value:g}; "
+            f"it must be in [{low[column]:g}, {high[column]:g}]"
+        )

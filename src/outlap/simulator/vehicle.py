@@ -7,11 +7,12 @@ and the largest row of a configuration.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated
 
 import numpy as np
 
-from outlap.config import Config, Number, bounded, bounds
+from outlap.config import Config, Number, bounded, bounds, widest
 
 # Columns of a car's parameter row. They follow the order of the fields below (a test holds them to it).
 MU = 0
@@ -75,14 +76,28 @@ KINEMATIC_SPEED = 57  # [m/s] not the user's: `dynamics.kinematic_speed` of the 
 N_PARAMS = 58
 
 
-Finite = Number  # which Config already keeps finite and in order
-Positive = Annotated[Number, bounded(above=0)]
-Negative = Annotated[Number, bounded(below=0)]
-NonNegative = Annotated[Number, bounded(at_least=0)]
-NonPositive = Annotated[Number, bounded(at_most=0)]
+# What a `Number` of a car may be: from a toy to a lorry. Beyond, single precision or the integrator gives way.
+Friction = Annotated[Number, bounded(at_least=0.01, at_most=10)]  # [-]
+Stiffness = Annotated[Number, bounded(at_least=0.01, at_most=1000)]  # [1/rad], or [-] of longitudinal slip
+OpposingStiffness = Annotated[Number, bounded(at_least=-1000, at_most=-0.01)]
+Shape = Annotated[Number, bounded(at_least=0.01, at_most=10)]  # [-]
+Coefficient = Annotated[Number, bounded(at_least=-1000, at_most=1000)]
+Distance = Annotated[Number, bounded(at_least=0.01, at_most=20)]  # [m]
+Height = Annotated[Number, bounded(at_least=0, at_most=20)]  # [m]
+Place = Annotated[Number, bounded(at_least=-20, at_most=20)]  # [m]
+Mass = Annotated[Number, bounded(at_least=0.01, at_most=1e5)]  # [kg]
+Inertia = Annotated[Number, bounded(at_least=1e-6, at_most=1e6)]  # [kg m^2]
+Rate = Annotated[Number, bounded(at_least=0.01, at_most=1000)]  # [rad/s] or [m/s^2]
+Speed = Annotated[Number, bounded(at_least=0.01, at_most=200)]  # [m/s]
+ReverseSpeed = Annotated[Number, bounded(at_least=-200, at_most=0)]  # [m/s]
+LeftAngle = Annotated[Number, bounded(at_least=0.01, below=1.5)]  # [rad]
+RightAngle = Annotated[Number, bounded(above=-1.5, at_most=-0.01)]
+Gain = Annotated[Number, bounded(at_least=0.01, at_most=1e9)]
+Duration = Annotated[Number, bounded(at_least=0, at_most=1000)]  # [s]
+Range = Annotated[Number, bounded(at_least=0.01, at_most=1000)]  # [m]
+RangeError = Annotated[Number, bounded(at_least=-1000, at_most=1000)]  # [m]
+Deviation = Annotated[Number, bounded(at_least=0, at_most=1000)]  # [m]
 Fraction = Annotated[Number, bounded(at_least=0, at_most=1)]
-LeftAngle = Annotated[Number, bounded(above=0, below=1.5)]
-RightAngle = Annotated[Number, bounded(above=-1.5, below=0)]
 
 
 class PacejkaTyre(Config):
@@ -93,31 +108,31 @@ class PacejkaTyre(Config):
     lateral friction in every model.
     """
 
-    p_cx1: Positive = 1.6411  # longitudinal shape factor [-]
-    p_dx1: Positive = 1.1739  # longitudinal friction [-]
-    p_ex1: Finite = 0.46403  # longitudinal curvature [-]
-    p_kx1: Positive = 22.303  # longitudinal slip stiffness / load [-]
-    p_hx1: Finite = 0.0012297  # longitudinal horizontal shift [-]
-    p_vx1: Finite = -8.8098e-06  # longitudinal vertical shift / load [1/N]
-    r_bx1: Finite = 13.276  # combined longitudinal: slope [1/rad]
-    r_bx2: Finite = -13.778  # combined longitudinal: slope's change with slip [-]
-    r_cx1: Finite = 1.2568  # combined longitudinal: shape factor [-]
-    r_ex1: Finite = 0.65225  # combined longitudinal: curvature [-]
-    r_hx1: Finite = 0.0050722  # combined longitudinal: shift [rad]
-    p_cy1: Positive = 1.3507  # lateral shape factor [-]
-    p_dy1: Positive = 1.0489  # lateral friction [-]
-    p_ey1: Finite = -0.0074722  # lateral curvature [-]
-    p_ky1: Negative = -21.92  # cornering stiffness / load [1/rad]
-    r_by1: Finite = 7.1433  # combined lateral: slope [-]
-    r_by2: Finite = 9.1916  # combined lateral: slope's change with slip angle [1/rad]
-    r_by3: Finite = -0.027856  # combined lateral: shift of that change [rad]
-    r_cy1: Finite = 1.0719  # combined lateral: shape factor [-]
-    r_ey1: Finite = -0.27572  # combined lateral: curvature [-]
-    r_hy1: Finite = 5.7448e-06  # combined lateral: shift [-]
-    r_vy1: Finite = -0.027825  # side force from longitudinal slip / (mu load) [-]
-    r_vy4: Finite = 12.12  # its change with slip angle [1/rad]
-    r_vy5: Finite = 1.9  # its change with slip: shape [-]
-    r_vy6: Finite = -10.704  # its change with slip: slope [-]
+    p_cx1: Shape = 1.6411  # longitudinal shape factor [-]
+    p_dx1: Friction = 1.1739  # longitudinal friction [-]
+    p_ex1: Coefficient = 0.46403  # longitudinal curvature [-]
+    p_kx1: Stiffness = 22.303  # longitudinal slip stiffness / load [-]
+    p_hx1: Coefficient = 0.0012297  # longitudinal horizontal shift [-]
+    p_vx1: Coefficient = -8.8098e-06  # longitudinal vertical shift / load [1/N]
+    r_bx1: Coefficient = 13.276  # combined longitudinal: slope [1/rad]
+    r_bx2: Coefficient = -13.778  # combined longitudinal: slope's change with slip [-]
+    r_cx1: Coefficient = 1.2568  # combined longitudinal: shape factor [-]
+    r_ex1: Coefficient = 0.65225  # combined longitudinal: curvature [-]
+    r_hx1: Coefficient = 0.0050722  # combined longitudinal: shift [rad]
+    p_cy1: Shape = 1.3507  # lateral shape factor [-]
+    p_dy1: Friction = 1.0489  # lateral friction [-]
+    p_ey1: Coefficient = -0.0074722  # lateral curvature [-]
+    p_ky1: OpposingStiffness = -21.92  # cornering stiffness / load [1/rad]
+    r_by1: Coefficient = 7.1433  # combined lateral: slope [-]
+    r_by2: Coefficient = 9.1916  # combined lateral: slope's change with slip angle [1/rad]
+    r_by3: Coefficient = -0.027856  # combined lateral: shift of that change [rad]
+    r_cy1: Coefficient = 1.0719  # combined lateral: shape factor [-]
+    r_ey1: Coefficient = -0.27572  # combined lateral: curvature [-]
+    r_hy1: Coefficient = 5.7448e-06  # combined lateral: shift [-]
+    r_vy1: Coefficient = -0.027825  # side force from longitudinal slip / (mu load) [-]
+    r_vy4: Coefficient = 12.12  # its change with slip angle [1/rad]
+    r_vy5: Coefficient = 1.9  # its change with slip: shape [-]
+    r_vy6: Coefficient = -10.704  # its change with slip: slope [-]
 
 
 class VehicleParams(Config):
@@ -127,26 +142,26 @@ class VehicleParams(Config):
     chassis: 0.1 m wheels of about 0.12 kg, two an axle, plus the motor's rotor through the gearbox.
     """
 
-    mu: Positive = 1.0489  # tyre-road friction [-]
-    C_Sf: Positive = 4.718  # cornering stiffness / (mu load), front [1/rad]
-    C_Sr: Positive = 5.4562  # cornering stiffness / (mu load), rear [1/rad]
-    lf: Positive = 0.15875  # centre of gravity to front axle [m]
-    lr: Positive = 0.17145  # centre of gravity to rear axle [m]
-    h: NonNegative = 0.074  # height of the centre of gravity [m]
-    m: Positive = 3.74  # mass [kg]
-    I: Positive = 0.04712  # noqa: E741
+    mu: Friction = 1.0489  # tyre-road friction [-]
+    C_Sf: Stiffness = 4.718  # cornering stiffness / (mu load), front [1/rad]
+    C_Sr: Stiffness = 5.4562  # cornering stiffness / (mu load), rear [1/rad]
+    lf: Distance = 0.15875  # centre of gravity to front axle [m]
+    lr: Distance = 0.17145  # centre of gravity to rear axle [m]
+    h: Height = 0.074  # height of the centre of gravity [m]
+    m: Mass = 3.74  # mass [kg]
+    I: Inertia = 0.04712  # noqa: E741
     """yaw inertia [kg m^2]"""
-    width: Positive = 0.31  # of the body [m]
-    length: Positive = 0.58  # of the body [m]
+    width: Distance = 0.31  # of the body [m]
+    length: Distance = 0.58  # of the body [m]
     steer_min: RightAngle = -0.4189  # right stop [rad]
     steer_max: LeftAngle = 0.4189  # left stop [rad]
-    steer_rate_max: Positive = 3.2  # either way [rad/s]
-    a_max: Positive = 9.51  # either way [m/s^2]
-    v_switch: Positive = 7.319  # above it, power limits acceleration to a_max v_switch / v [m/s]
-    v_min: NonPositive = -5.0  # fastest reverse [m/s]
-    v_max: Positive = 20.0  # fastest forward [m/s]
-    wheel_radius: Positive = 0.0508  # [m]
-    wheel_inertia: Positive = 6e-4  # of an axle about its spin, with its share of the drive train [kg m^2]
+    steer_rate_max: Rate = 3.2  # either way [rad/s]
+    a_max: Rate = 9.51  # either way [m/s^2]
+    v_switch: Speed = 7.319  # above it, power limits acceleration to a_max v_switch / v [m/s]
+    v_min: ReverseSpeed = -5.0  # fastest reverse [m/s]
+    v_max: Speed = 20.0  # fastest forward [m/s]
+    wheel_radius: Distance = 0.0508  # [m]
+    wheel_inertia: Inertia = 6e-4  # of an axle about its spin, with its share of the drive train [kg m^2]
     brake_split: Fraction = 0.5  # front share of the braking torque [-]
     engine_split: Fraction = 0.5  # front share of the driving torque [-]
     tyre: PacejkaTyre = PacejkaTyre()  # of the drift model
@@ -155,21 +170,21 @@ class VehicleParams(Config):
 class ActuatorParams(Config):
     """How commands (steering angle, speed) become a steering rate and an acceleration."""
 
-    steer_gain: Positive = 1e6  # steering rate / angle error; 1 / step or more is bang-bang [1/s]
-    steer_delay: NonNegative = 0.0  # rounded to physics steps [s]
-    steer_lag: NonNegative = 0.0  # time constant of a first-order lag; 0 = none [s]
-    speed_gain: Positive = 10.0  # the F1TENTH gym's: acceleration = gain a_max / v_max, speed error [-]
-    speed_delay: NonNegative = 0.0  # rounded to physics steps [s]
-    speed_lag: NonNegative = 0.0  # time constant of a first-order lag; 0 = none [s]
+    steer_gain: Gain = 1e6  # steering rate / angle error; 1 / step or more is bang-bang [1/s]
+    steer_delay: Duration = 0.0  # rounded to physics steps [s]
+    steer_lag: Duration = 0.0  # time constant of a first-order lag; 0 = none [s]
+    speed_gain: Gain = 10.0  # the F1TENTH gym's: acceleration = gain a_max / v_max, speed error [-]
+    speed_delay: Duration = 0.0  # rounded to physics steps [s]
+    speed_lag: Duration = 0.0  # time constant of a first-order lag; 0 = none [s]
 
 
 class LidarParams(Config):
     """Where the scanner sits and what is wrong with its ranges."""
 
-    mount_x: Finite = 0.0  # in front of the centre of gravity [m]
-    max_range: Positive = 30.0  # [m]
-    noise_std: NonNegative = 0.0  # Gaussian, independent per beam [m]
-    bias: Finite = 0.0  # added to every range [m]
+    mount_x: Place = 0.0  # in front of the centre of gravity [m]
+    max_range: Range = 30.0  # [m]
+    noise_std: Deviation = 0.0  # Gaussian, independent per beam [m]
+    bias: RangeError = 0.0  # added to every range [m]
     dropout: Fraction = 0.0  # probability that a beam reads max_range [-]
 
 
@@ -198,6 +213,20 @@ def parameter_bounds(
     ends.append((0.0, 0.0))  # KINEMATIC_SPEED
     table = np.array(ends, dtype=np.float32)
     return table[:, 0].copy(), table[:, 1].copy()
+
+
+@cache
+def accepted_rows() -> tuple[np.ndarray, np.ndarray]:
+    """The ends of what a parameter row may hold, whatever the configuration: float32 (N_PARAMS,) each.
+
+    A car's v_max may be 0 too: that of an opponent that is to stand.
+    """
+    parts = _parts(VehicleParams(), ActuatorParams(), LidarParams())
+    ends = [widest(type(part), name) for _, part in parts for name in _numbers(part)]
+    ends.append((0.0, float(np.finfo(np.float32).max)))  # KINEMATIC_SPEED
+    low, high = np.array(ends, dtype=np.float32).T
+    low[V_MAX] = 0.0
+    return low, high
 
 
 def parameter_names() -> list[str]:

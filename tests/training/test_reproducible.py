@@ -1,0 +1,91 @@
+"""The same seed and as many threads of PyTorch give the same rows and the same weights, bit for bit.
+
+Those of Numba change nothing at all: see tests/simulator/test_batch.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from outlap.drivers.policy import PolicyDriver
+from outlap.envs.race_config import RaceConfig
+from outlap.envs.sb3_vec_env import SB3VecEnv
+from outlap.evaluation.rollout import evaluate
+from outlap.mql.adaptation import AdaptationSettings, adapt
+from outlap.mql.mql import MQL
+from outlap.track import Track
+from outlap.training.mql import MQLConfig
+from outlap.training.ppo import PPOConfig
+from outlap.training.run import Run, load_run
+from outlap.training.session import Progress, TrainingConfig, train
+
+ENV = RaceConfig(
+    tracks=("ring5",), beams=32, control_interval=5, speed_range=(0.0, 4.0), observation=("scan", "vel"),
+    scale_observations=True, vehicle={"mu": (0.5, 1.1)}, lidar={"noise_std": 0.02},  # type: ignore[arg-type]
+    termination={"time_limit": 2.0},  # type: ignore[arg-type]
+)  # fmt: skip
+# Wide layers and large batches: PyTorch leaves small ones to one thread.
+CONFIGS: dict[str, TrainingConfig] = {
+    "ppo": PPOConfig(env=ENV, total_steps=1024, num_envs=16, n_steps=32, batch_size=512, n_epochs=2,
+                     net_arch=(128, 128), checkpoint_every=10**9),
+    "mql": MQLConfig(env=ENV, total_steps=512, num_envs=8, learning_starts=440, batch_size=256, buffer_size=2000,
+                     checkpoint_every=10**9),
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def as_many_threads_as_before() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def trained(algorithm: str, threads: int, name: str) -> tuple[Run, list[tuple], list[np.ndarray]]:
+    """A run, its learning curve and its final weights."""
+    rows: list[tuple] = []
+
+    def note(now: Progress) -> None:
+        rows.append((now.steps, now.crash_rate, now.mean_speed_mps, now.progress_m))
+
+    config = CONFIGS[algorithm].model_copy(update={"threads": threads})
+    run = train(config, Path(name), on_progress=note)
+    assert torch.get_num_threads() == threads
+    state = config.model_class().load(run.policy_path, device="cpu").policy.state_dict()
+    return run, rows, [value.numpy() for value in state.values()]
+
+
+@pytest.mark.parametrize("algorithm", CONFIGS)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_training_repeats_its_learning_curve_and_its_weights(algorithm, threads):
+    (_, rows, weights), (_, rows_again, weights_again) = (trained(algorithm, threads, name) for name in "ab")
+    assert len(rows) == 2
+    assert repr(rows) == repr(rows_again)  # NaN, where no episode has ended, is NaN again
+    for one, other in zip(weights, weights_again, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_adaptation_and_an_evaluation_repeat_their_rows(threads):
+    trained("mql", 1, "meta")
+    torch.set_num_threads(threads)
+    rows, updates, weights = [], [], []
+    for _ in range(2):
+        run = load_run("meta")
+        meta = MQL.load(run.policy_path, device="cpu")
+        meta.load_replay_buffer(run.replay_path)
+        task = SB3VecEnv(4, **dict(run.config.env))
+        task.seed(5)
+        settings = AdaptationSettings(iterations=1, collect_steps=20, on_task_steps=2, replay_steps=3)
+        policy, record = adapt(meta, task, settings, seed=2)
+        updates.append(repr(record.updates))
+        weights.append(np.concatenate([value.numpy().ravel() for value in policy.state_dict().values()]))
+        driver = PolicyDriver(meta, scale_observations=True)
+        rows.append(evaluate(driver, run.config.env, [Track.load("ring5")], episodes=8, seed=1))
+    assert updates[0] == updates[1]
+    np.testing.assert_array_equal(*weights)
+    assert rows[0].equals(rows[1])
