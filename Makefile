@@ -35,5 +35,5 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo \
 	  "cannot make a virtual environment: on Debian and Ubuntu, apt install python3-venv" >&2; exit 1; }
 	@echo "installing outlap and its dependencies into $(VENV): a few minutes the first time" >&2
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
 	@touch $@

@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-MOMENTS = (0.3, 1.5, 3.0, 5.0, 8.0, 14.0)  # [s] after the start: from imports to the midst of the work
+MOMENTS = (3.0, 12.0, 25.0)  # [s] after the start: from imports to the midst of the work
 PATIENCE = 60.0  # [s] until a process is taken for one that hangs
 ENDLESS = "1_000_000_000"
 

@@ -14,7 +14,7 @@ from types import FrameType
 from outlap.processes import is_importing
 
 INTERRUPTED = 130
-IMPORT_PATIENCE = 1.0  # [s] that an import has to come to its end after Ctrl-C
+IMPORT_PATIENCE = 0.5  # [s] that an import has to come to its end after Ctrl-C
 RETRY = 0.05  # [s] between two looks whether it has
 NOTHING_KEPT = "nothing is kept; begin again with the same command"
 SHOW_CURSOR = "\x1b[?25h"
@@ -41,7 +41,8 @@ def ctrl_c_spares_imports() -> Iterator[None]:
         if first is None:
             first = time.monotonic()
         elif number == signal.SIGINT or time.monotonic() - first > IMPORT_PATIENCE:  # again, or for too long
-            print("\noutlap: interrupted", file=sys.stderr)
+            with suppress(OSError):
+                os.write(2, b"\noutlap: interrupted\n")  # sys.stderr may be somebody's buffer, or in use
             end_now(INTERRUPTED)
         signal.setitimer(signal.ITIMER_REAL, RETRY)
 
