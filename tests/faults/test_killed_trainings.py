@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import signal
+import time
 import zipfile
 from pathlib import Path
 
@@ -41,6 +42,9 @@ def weights(run: Run) -> np.ndarray:
 def resumed(algorithm: str, folder: Path) -> Run:
     """The run, gone on with to its end."""
     torch.set_num_threads(1)
+    # TensorBoard orders the files of a log by the second of their names, and then by the process: a resumed training in
+    # a process of its own begins later than that.
+    time.sleep(1.1)
     assert main(["train", algorithm, "--resume", str(folder), "--quiet"]) == 0
     return load_run(folder)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, field_validator
+from tyro.conf import arg
 
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
@@ -27,7 +28,7 @@ class MQLConfig(TrainingConfig):
             "reward": RewardConfig(collision_steps=3e6),
         }
     )
-    total_steps: int = Field(default=3_500_000, gt=0)  # actions, all worlds together
+    total_steps: Annotated[int, arg(aliases=["--steps"])] = Field(default=3_500_000, gt=0)  # actions, all worlds
     preset: Literal["fast", "paper"] = "fast"  # networks, see mql.networks
     history: int = Field(default=10, ge=1)  # steps that the context is made of
     uses_reward: bool = True  # whether the context is told the rewards, which a car does not have
