@@ -181,7 +181,10 @@ PARTS: dict[str, Callable[[Path], str]] = {
 
 def digests(folder: Path) -> dict[str, str]:
     """Of every part, in this process; `folder`/given holds the runs to adapt and to evaluate."""
+    import torch
+
     os.environ["OUTLAP_CACHE"] = str(folder / "cache")
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # as the field `threads` does
     found = {}
     for name, part in PARTS.items():
         found[name] = part(folder)
@@ -195,7 +198,8 @@ def digests(folder: Path) -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--digests", action="store_true", help="of this process alone, as JSON")
-    parser.add_argument("--folder", type=Path, help="of a setting: for its runs")
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=[*SETTINGS], help="by default all")
+    parser.add_argument("--folder", type=Path, help="for the runs; by default a temporary one")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
@@ -204,11 +208,11 @@ def main() -> None:
             return
         first = in_process({}, folder / "first")
         print(f"{'':28}" + " | ".join(PARTS))
-        for number, (name, setting) in enumerate(SETTINGS.items()):
+        for number, name in enumerate(options.settings):
             own = folder / str(number)
             own.mkdir()
             (own / "given").symlink_to(folder / "first")
-            found = in_process(setting, own)
+            found = in_process(SETTINGS[name], own)
             marks = ["same" if found[part] == first[part] else found[part] for part in PARTS]
             print(
                 f"{name:28}" + " | ".join(f"{mark:>{len(part)}}" for mark, part in zip(marks, PARTS, strict=True)),
