@@ -6,16 +6,19 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check install clean
+.PHONY: help demo test test-slow check install clean
 
 help:  ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST)
 
 demo: $(INSTALLED)  ## meta-train on built-in circuits, adapt to held-out ones and race there (at most 5 minutes)
 	$(BIN)/outlap demo
 
 test: $(INSTALLED)  ## run the tests (OUTLAP_TRACKS=FOLDER adds those that need real circuits)
 	$(BIN)/python -m pytest
+
+test-slow: $(INSTALLED)  ## run the tests of killed commands and of a Ray cluster (minutes)
+	$(BIN)/python -m pytest -m slow -n 1
 
 check: $(INSTALLED)  ## lint, formatting, types
 	$(BIN)/ruff check .

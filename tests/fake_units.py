@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from outlap.experiments.unit import Report, Unit
+from outlap.files import atomic_write
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class Fake(Unit):
         path = folder / "ticks"
         for tick in range(int(path.read_text()) if path.exists() else 0, self.ticks):
             time.sleep(0.05)
-            path.write_text(str(tick + 1))
+            atomic_write(path, str(tick + 1))
             report((tick + 1) / self.ticks)
         while self.until and not Path(self.until).exists():
             time.sleep(0.05)

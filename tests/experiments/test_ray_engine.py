@@ -28,6 +28,7 @@ from outlap.experiments.sweep import SweepConfig
 from outlap.experiments.tune import tune_trials
 from outlap.training.run import load_run
 
+pytestmark = pytest.mark.slow
 TESTS = str(Path(__file__).parents[1])
 
 
@@ -107,10 +108,14 @@ def test_a_lost_node_loses_no_unit_that_is_done_and_its_units_go_on_elsewhere(
 
 
 def test_a_unit_uses_its_share_of_a_gpu(cluster: Cluster, tmp_path: Path):
-    halves = [Fake(f"half {number}", ticks=10, on_gpu=True) for number in range(2)]
-    run_units(halves, tmp_path / "halves", RayEngine(gpu_share=0.5))
-    first, second = (begun(unit, tmp_path / "halves")[0] for unit in halves)
-    assert max(first, second) < min(ended(unit, tmp_path / "halves") for unit in halves)  # both at a time
+    work, together = tmp_path / "halves", tmp_path / "together"
+    halves = [Fake(f"half {number}", until=str(together), on_gpu=True) for number in range(2)]
+
+    def release(_: Status) -> None:
+        if all(begun(unit, work) for unit in halves):  # both at a time, or they would wait for ever
+            together.touch()
+
+    run_units(halves, work, RayEngine(gpu_share=0.5), on_status=release)
     whole = [Fake(f"whole {number}", ticks=10, on_gpu=True) for number in range(2)]
     run_units(whole, tmp_path / "whole", RayEngine(gpu_share=1.0))
     spans = sorted((begun(unit, tmp_path / "whole")[0], ended(unit, tmp_path / "whole")) for unit in whole)

@@ -16,6 +16,8 @@ from outlap.track import Track
 from outlap.track.download import LOCK_FILE, read_lock
 from track_archives import ArchiveServer, Request, circle_track, tar_xz, track_members
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def server() -> Iterator[ArchiveServer]:

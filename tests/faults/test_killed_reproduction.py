@@ -14,6 +14,8 @@ from commands import Commands, leftovers
 from one_process import OneProcess
 from outlap.cli.main import main
 
+pytestmark = pytest.mark.slow
+
 BUDGET = """
 title: as little as can be
 built_in: true

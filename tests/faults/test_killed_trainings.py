@@ -19,6 +19,8 @@ from outlap.experiments.figures import read_learning
 from outlap.mql.buffers import HistoryBuffer
 from outlap.training.run import Run, load_run
 
+pytestmark = pytest.mark.slow
+
 ENV = [
     "--env.tracks", "Foxglove", "--env.no-augment-tracks", "--env.beams", "8", "--env.termination.time-limit", "0.6",
     "--num-envs", "4", "--threads", "1", "--seed", "3", "--quiet",
