@@ -61,7 +61,7 @@ def generate_track(
     clockwise: bool | None = None,
     resolution: float = 0.05,
 ) -> Track:
-    """A random closed circuit; the same arguments give the same track, bit for bit.
+    """A random closed circuit; on one machine the same arguments give the same track, bit for bit.
 
     The start line is in the middle of the longest straight, at (0, 0).
 
