@@ -136,9 +136,8 @@ def full_run(folder: Path, rows: int) -> None:
         observation, reward, dones, infos = env.step(model.policy.unscale_action(action))
         buffer.add_step(env, observation, action, reward, dones, infos)  # type: ignore[arg-type]
     run = create_run(folder, config)
-    buffer.save(run.replay_path)
     model.num_timesteps = 1000
-    save_checkpoint(run, model, "checkpoints/step_000001000.zip")
+    save_checkpoint(run, model, "checkpoints/step_000001000.zip", "checkpoints/step_000001000.npz")
 
 
 def show(row: Interrupted) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -16,11 +17,13 @@ from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.evaluation.rollout import evaluate
+from outlap.experiments.figures import read_learning
 from outlap.mql.adaptation import AdaptationSettings, adapt
 from outlap.mql.mql import MQL
 from outlap.track import Track
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
+from outlap.training.recurrent_ppo import RecurrentPPOConfig
 from outlap.training.run import Run, load_run
 from outlap.training.session import Progress, TrainingConfig, train
 
@@ -67,6 +70,53 @@ def test_a_training_repeats_its_learning_curve_and_its_weights(algorithm, thread
     assert repr(rows) == repr(rows_again)  # NaN, where no episode has ended, is NaN again
     for one, other in zip(weights, weights_again, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+class Killed(Exception):
+    """Ends a training as a kill does: nothing is saved."""
+
+
+FREQUENT = {"env": ENV, "threads": 1, "total_steps": 1024, "checkpoint_every": 256}  # checkpoints
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        PPOConfig(**FREQUENT, num_envs=8, n_steps=8, batch_size=32, n_epochs=1, net_arch=(16,)),
+        RecurrentPPOConfig(**FREQUENT, num_envs=8, n_steps=8, batch_size=32, n_epochs=1, net_arch=(16,), lstm_hidden=8),
+        MQLConfig(**FREQUENT, num_envs=4, learning_starts=400, batch_size=16, buffer_size=700),
+    ],
+    ids=lambda config: config.algorithm,
+)
+def test_a_training_resumed_from_a_checkpoint_is_the_one_that_was_never_stopped(config: TrainingConfig):
+    undisturbed, stopped = Path("undisturbed"), Path("stopped")
+    run = train(config, undisturbed)
+
+    def kill(now: Progress) -> None:
+        if now.steps > 0.6 * config.total_steps:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(config, stopped, on_progress=kill)
+    steps = [int(path.stem.removeprefix("step_")) for path in load_run(stopped).checkpoints()]
+    assert steps == [config.total_steps // 2, config.total_steps // 4]
+    for rng in (torch.manual_seed, np.random.seed):  # whatever the next process begins with
+        rng(99)
+    same = train(config, stopped, resume=load_run(stopped))
+    weights, weights_again = (
+        config.model_class().load(each.policy_path, device="cpu").policy.state_dict() for each in (run, same)
+    )
+    for name, value in weights.items():
+        np.testing.assert_array_equal(value.numpy(), weights_again[name].numpy())
+    curve, curve_again = (read_learning(each.folder) for each in (run, same))
+    assert len(curve) > 2
+    pd.testing.assert_frame_equal(curve, curve_again)
+    if config.algorithm == "mql":
+        with np.load(run.replay_path) as one, np.load(same.replay_path) as other:
+            assert one.files == other.files
+            for name in one.files:
+                np.testing.assert_array_equal(one[name], other[name])
+        assert not list(stopped.glob("checkpoints/*.npz"))  # but the finished one's
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -18,8 +18,8 @@ EVERY_STEP = ("track", "task")
 class SB3VecEnv(VecEnv):
     """`num_envs` worlds of `RaceVectorEnv` for Stable-Baselines3.
 
-    The `infos` of a world whose episode just ended hold its `outcome`, `episode` (`r`, `l`, `t`, and all of
-    `EPISODE_FIELDS`), every reward term, `terminal_observation` and `TimeLimit.truncated`.
+    The `infos` of a world whose episode just ended hold its `outcome`, every reward term, `terminal_observation`,
+    `TimeLimit.truncated`, and `episode`: `r`, `l`, `t`, `outcome`, all of `EPISODE_FIELDS`, every reward term.
     """
 
     def __init__(self, num_envs: int = 1, **config: Any) -> None:
@@ -54,10 +54,11 @@ class SB3VecEnv(VecEnv):
             infos[world] = {
                 **final,
                 "episode": {
-                    "r": final["episode_return"],
+                    "r": float(final["episode_return"]),
                     "l": int(final["episode_steps"]),
-                    "t": final["time_s"],
-                    **{name: final[name] for name in EPISODE_FIELDS},
+                    "t": float(final["time_s"]),
+                    "outcome": str(final["outcome"]),
+                    **{name: float(value) for name, value in final.items() if _is_told_of_episodes(name)},
                 },
                 "terminal_observation": info["final_obs"][world],
                 "TimeLimit.truncated": bool(truncated[world]),
@@ -92,3 +93,7 @@ class SB3VecEnv(VecEnv):
     @staticmethod
     def _world_info(info: dict[str, Any], world: int) -> dict[str, Any]:
         return {name: info[name][world] for name in EVERY_STEP}
+
+
+def _is_told_of_episodes(name: str) -> bool:
+    return name in EPISODE_FIELDS or name.startswith("reward_")

@@ -125,9 +125,6 @@ class MQL(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        first, second = np.random.SeedSequence(self.seed).spawn(2)
-        self._rng = np.random.default_rng(first)  # batches and exploration
-        self._noise = torch.Generator(self.device).manual_seed(int(second.generate_state(1)[0]))  # target actions
         self.replay_buffer = HistoryBuffer(
             self.buffer_size, self.observation_space, self.action_space.shape[0], self.n_envs,  # type: ignore[arg-type, index]
             task_capacity=self.task_buffer_size,
@@ -136,6 +133,13 @@ class MQL(OffPolicyAlgorithm):
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
         ).to(self.device)  # type: ignore[assignment]
         self._convert_train_freq()
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed all that is drawn from here on, the environment at its next reset too; None: at random."""
+        super().set_random_seed(seed)
+        first, second = np.random.SeedSequence(seed).spawn(2)
+        self._rng = np.random.default_rng(first)  # batches and exploration
+        self._noise = torch.Generator(self.device).manual_seed(int(second.generate_state(1)[0]))  # target actions
 
     def _setup_learn(self, *args: Any, **kwargs: Any):
         before = self._last_obs

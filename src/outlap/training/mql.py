@@ -10,7 +10,7 @@ from tyro.conf import arg
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.training.ppo import PPOConfig
-from outlap.training.session import TrainingConfig
+from outlap.training.session import RECENT_EPISODES, TrainingConfig
 
 if TYPE_CHECKING:
     from outlap.envs.sb3_vec_env import SB3VecEnv
@@ -87,6 +87,7 @@ class MQLConfig(TrainingConfig):
                 "uses_reward": self.uses_reward,
                 "uses_context": self.uses_context,
             },
+            stats_window_size=RECENT_EPISODES,
             seed=self.seed,
             device=self.device,
         )

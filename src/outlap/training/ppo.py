@@ -9,7 +9,7 @@ from pydantic import Field
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.simulator.vehicle import LidarParams, VehicleParams
-from outlap.training.session import TrainingConfig
+from outlap.training.session import RECENT_EPISODES, TrainingConfig
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -64,6 +64,7 @@ class PPOConfig(TrainingConfig):
             "ent_coef": self.ent_coef,
             "vf_coef": self.vf_coef,
             "max_grad_norm": self.max_grad_norm,
+            "stats_window_size": RECENT_EPISODES,
             "seed": self.seed,
             "device": self.device,
         }

@@ -2,9 +2,9 @@
 
 config.yaml      the configuration
 run.json         command, seed, versions, machine, how far it came
-checkpoints/     step_N.zip, the newest few
+checkpoints/     step_N.zip, the newest few, and step_N.npz, the replay of the newest
 policy.zip       the finished policy
-replay.npz       what an off-policy learner has seen
+replay.npz       what an off-policy learner has seen, the newest of it
 tensorboard/
 """
 
@@ -59,8 +59,9 @@ class Run:
 
     @property
     def replay_path(self) -> Path:
-        """The replay of a learner that has one."""
-        return self.folder / "replay.npz"
+        """The replay of the finished policy, or else of the newest checkpoint, for a learner that has one."""
+        finished = self.folder / "replay.npz"
+        return finished if finished.exists() else max(self.replays(), key=_steps_of, default=finished)
 
     def driver(self, *, deterministic: bool = True, seed: int = 0) -> PolicyDriver:
         """The policy as a driver. Its zip can run code when it is loaded: load those of people you trust."""
@@ -80,8 +81,15 @@ class Run:
 
     def checkpoints(self) -> list[Path]:
         """Checkpoints, newest first."""
-        found = (self.folder / "checkpoints").glob("step_*.zip")
-        return sorted((p for p in found if re.fullmatch(r"step_\d+", p.stem)), key=_steps_of, reverse=True)
+        return sorted(self._of_checkpoints(".zip"), key=_steps_of, reverse=True)
+
+    def replays(self) -> list[Path]:
+        """Replays of checkpoints: the newest one's, and another while it is written."""
+        return self._of_checkpoints(".npz")
+
+    def _of_checkpoints(self, suffix: str) -> list[Path]:
+        found = (self.folder / "checkpoints").glob(f"step_*{suffix}")
+        return [path for path in found if re.fullmatch(r"step_\d+", path.stem)]
 
     @property
     def finished(self) -> bool:
@@ -150,12 +158,17 @@ def _config_class(content: Any, path: Path) -> type[TrainingConfig]:
     return classes[name]
 
 
-def save_checkpoint(run: Run, model: Any, name: str) -> Path:
-    """Write a Stable-Baselines3 model beside its place and rename it there; drop the oldest checkpoints."""
-    path = run.folder / name
+def save_checkpoint(run: Run, model: Any, name: str, replay_name: str) -> Path:
+    """Write a Stable-Baselines3 model, and its replay before it: no model is without the one that belongs to it.
+
+    Both are written beside their places and renamed there. Then the oldest checkpoints go, and other replays.
+    """
+    path, replay = run.folder / name, run.folder / replay_name
+    if getattr(model, "replay_buffer", None) is not None:
+        model.save_replay_buffer(replay)
     with replacing(path) as partial:
         model.save(partial)
-    for old in run.checkpoints()[CHECKPOINTS_KEPT:]:
+    for old in (*run.checkpoints()[CHECKPOINTS_KEPT:], *(each for each in run.replays() if each != replay)):
         old.unlink(missing_ok=True)
     return path
 

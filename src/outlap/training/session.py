@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from abc import abstractmethod
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LARGEST_WEIGHT = 1e8  # of a network that has not diverged
-RECENT_EPISODES = 500  # over which training statistics are taken
+RECENT_EPISODES = 500  # over which training statistics are taken; a checkpoint keeps them
 
 
 class TrainingConfig(Config):
@@ -145,8 +144,7 @@ def train(
     run.write_record(tracks={track.name: track.fingerprint for track in environment.env.tasks.tracks})
     begun_at = model.num_timesteps
     environment.env.training_steps = begun_at
-    # A resumed run must not race the episodes again that it has raced before.
-    environment.seed(int(np.random.SeedSequence([config.seed, begun_at]).generate_state(1)[0]))
+    _seed_stint(model, config)
     if resume:
         _forget_curve_after(begun_at, run.folder / "tensorboard")
     model.set_logger(configure(str(run.folder / "tensorboard"), ["tensorboard"]))
@@ -166,8 +164,7 @@ def train(
         _check_finite(model, run)  # a network that has diverged breaks other things first
         raise
     _check_finite(model, run)
-    _save_replay(run, model)
-    save_checkpoint(run, model, "policy.zip")
+    save_checkpoint(run, model, "policy.zip", "replay.npz")
     run.note_pace(
         model.num_timesteps,
         clock.seconds,
@@ -185,16 +182,28 @@ def _forget_curve_after(steps: int, folder: Path) -> None:
 
 
 def _save(run: Run, model: Any, clock: Stopwatch) -> None:
-    """A checkpoint; the replay first, so that none is without one."""
-    _save_replay(run, model)
-    save_checkpoint(run, model, f"checkpoints/step_{model.num_timesteps:09d}.zip")
+    """A checkpoint."""
+    name = f"checkpoints/step_{model.num_timesteps:09d}"
+    save_checkpoint(run, model, f"{name}.zip", f"{name}.npz")
     run.note_pace(model.num_timesteps, clock.seconds)
 
 
-def _save_replay(run: Run, model: Any) -> None:
+def _seed_stint(model: Any, config: TrainingConfig) -> None:
+    """Let all that is random from here on follow from the run's seed and the steps so far.
+
+    A stint is what is trained from one checkpoint to the next. Each begins with new episodes, and depends on nothing but
+    the checkpoint: a training that is resumed there is, bit for bit, the one that was never stopped.
+    """
+    model.set_random_seed(int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]))
+
+
+def _begin_episodes(model: Any) -> None:
+    """Begin one in every world, as `learn` does where it resumes a training."""
+    model._last_obs = model.env.reset()
+    model._last_episode_starts = np.ones(model.n_envs, bool)
     replay = getattr(model, "replay_buffer", None)
     if replay is not None:
-        replay.save(run.replay_path)
+        replay.begin_all(model.env, model._last_obs)
 
 
 def _newest_model(run: Run, environment, config: TrainingConfig):
@@ -206,9 +215,11 @@ def _newest_model(run: Run, environment, config: TrainingConfig):
             log.warning("%s: cannot be read, and is left out; the one before is taken", path)
             run.write_record(**{f"unreadable_{path.name}": str(error)})
             continue
-        if run.replay_path.exists():
+        own = path.with_suffix(".npz")
+        replay = own if own.exists() else run.replay_path
+        if replay.exists():
             try:
-                model.load_replay_buffer(run.replay_path)  # type: ignore[attr-defined]
+                model.load_replay_buffer(replay)  # type: ignore[attr-defined]
             except OutlapError as error:
                 log.warning("%s; the training goes on with an empty one", error)
         return model
@@ -234,41 +245,38 @@ def _watcher(run: Run, config: TrainingConfig, clock: Stopwatch, on_progress: Ca
         """Logs episodes by outcome and reward term; writes checkpoints; reports progress."""
 
         def _on_training_start(self) -> None:
-            self.episodes: deque[dict] = deque(maxlen=RECENT_EPISODES)
-            self.saved_at = self.model.num_timesteps
-            self.reported_at = self.model.num_timesteps
+            self.saved_at = self.reported_at = self.model.num_timesteps
 
         def _on_step(self) -> bool:
-            self.episodes.extend(info for info in self.locals["infos"] if "episode" in info)
             return True
 
         def _on_rollout_start(self) -> None:
             # Here, and not where a rollout ends: by now the policy has learnt from all that it has seen.
             _check_finite(self.model, run)
-            if self.model.num_timesteps - self.saved_at >= config.checkpoint_every:
+            steps = self.model.num_timesteps
+            if steps - self.saved_at >= config.checkpoint_every:
+                self.logger.dump(steps)  # what is noted so far belongs to this stint
                 _save(run, self.model, clock)
-                self.saved_at = self.model.num_timesteps
+                self.saved_at = self.reported_at = steps
+                _seed_stint(self.model, config)
+                _begin_episodes(self.model)
 
         def _on_rollout_end(self) -> None:
             if self.model.num_timesteps - self.reported_at < config.report_every:
                 return
             self.reported_at = self.model.num_timesteps
+            episodes = self.model.ep_info_buffer or []
+            terms = [name for name in episodes[-1] if name.startswith("reward_")] if episodes else []
             numbers = {
-                name: float(np.mean([episode[name] for episode in self.episodes]))
-                for name in (
-                    "progress_m",
-                    "mean_speed_mps",
-                    "completed_laps",
-                    "episode_return",
-                    *self._terms(),
-                )
-                if self.episodes
+                name: float(np.mean([episode[name] for episode in episodes]))
+                for name in ("progress_m", "mean_speed_mps", "completed_laps", "episode_return", *terms)
+                if episodes
             }
             for name, number in numbers.items():
                 self.logger.record(f"race/{name}", number)
             crash_rate = None
-            if self.episodes:
-                crash_rate = float(np.mean([episode["outcome"] == CRASH for episode in self.episodes]))
+            if episodes:
+                crash_rate = float(np.mean([episode["outcome"] == CRASH for episode in episodes]))
                 self.logger.record("race/crash_rate", crash_rate)
             steps = self.model.num_timesteps
             if on_progress is not None:
@@ -282,8 +290,5 @@ def _watcher(run: Run, config: TrainingConfig, clock: Stopwatch, on_progress: Ca
                         progress_m=numbers.get("progress_m"),
                     )
                 )
-
-        def _terms(self) -> list[str]:
-            return [name for name in self.episodes[-1] if name.startswith("reward_")] if self.episodes else []
 
     return Watcher()
