@@ -23,7 +23,6 @@ from fake_units import Fake, begun, ended
 from outlap.errors import OutlapError
 from outlap.experiments.ray_engine import RayEngine
 from outlap.experiments.runner import Status, run_units
-from outlap.experiments.store import Store
 from outlap.experiments.sweep import SweepConfig
 from outlap.experiments.tune import tune_trials
 from outlap.training.run import load_run
@@ -164,25 +163,6 @@ def wait_for(there) -> None:
     while not there():
         assert time.monotonic() < deadline
         time.sleep(0.05)
-
-
-def test_an_unfinished_unit_is_copied_to_the_store_now_and_then(tmp_path: Path):
-    store, unit = Store(f"file://{tmp_path / 'store'}"), Fake("long", ticks=3)
-    folder = unit.folder(tmp_path / "here")
-    folder.mkdir(parents=True)
-    (folder / "ticks").write_text("2")
-    (folder / ".lock").touch()
-    store.put_part(unit, tmp_path / "here")
-    assert store.done() == set()
-    assert store.get(unit, tmp_path / "there")
-    assert (unit.folder(tmp_path / "there") / "ticks").read_text() == "2"
-    assert not (unit.folder(tmp_path / "there") / ".lock").exists()
-    (folder / "ticks").write_text("3")
-    store.put(unit, tmp_path / "here")
-    assert store.done() == {unit.key}
-    assert store.get(unit, tmp_path / "there")
-    assert (unit.folder(tmp_path / "there") / "ticks").read_text() == "3"
-    assert [path.name for path in (tmp_path / "store").rglob("*") if path.is_file()] == [f"long-{unit.key}.tar"]
 
 
 def test_what_cannot_be_is_said_in_one_line(cluster: Cluster, tmp_path: Path):

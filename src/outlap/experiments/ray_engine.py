@@ -236,9 +236,8 @@ def _do_in_common_folder(unit: Unit, work: Path, tell: Any) -> float:
 
 def _do_with_store(unit: Unit, scratch: Path, store: Store, tell: Any) -> float:
     for needed in {each.key: each for each in _all_needs(unit)}.values():
-        if not store.get(needed, scratch):
-            raise OutlapError(f"{store.url}: has lost {needed.name}, which {unit.name} needs; run it all again")
-    store.get(unit, scratch)
+        store.get(needed, scratch)
+    store.get_part(unit, scratch)
     keep = _every(STORE_EVERY, lambda _: store.put_part(unit, scratch))
     ask = _every(REPORT_EVERY, lambda share: _stop_if(tell(share)))
 

@@ -28,7 +28,8 @@ class Store:
         from fsspec.core import url_to_fs
 
         try:
-            self.files, root = url_to_fs(url)
+            # What it remembers of a folder it would not ask for again, and others write there.
+            self.files, root = url_to_fs(url, use_listings_cache=False)
         except (ImportError, ValueError) as error:  # a protocol without its package, or no protocol at all
             raise OutlapError(f"--store {url}: cannot be used: {error}") from None
         self.url, self.root = url, root.rstrip("/")
@@ -59,14 +60,14 @@ class Store:
         """Keep what there is of a unit that is not done yet."""
         self._put(unit, work, ".part.tar")
 
-    def get(self, unit: Unit, work: Path) -> bool:
-        """Bring a unit that is done, or else what there is of it; whether there was anything."""
-        for suffix in (".tar", ".part.tar"):
-            path = self._path(unit, suffix)
-            if self.files.exists(path):
-                self._get(path, unit.folder(work))
-                return True
-        return False
+    def get(self, unit: Unit, work: Path) -> None:
+        """Bring a unit that is done. Raises OutlapError where it is gone."""
+        if not self._get(unit, work, ".tar"):
+            raise OutlapError(f"{self.url}: has lost {unit.name}; run it all again")
+
+    def get_part(self, unit: Unit, work: Path) -> None:
+        """Bring what there is of a unit, if anything."""
+        self._get(unit, work, ".tar") or self._get(unit, work, ".part.tar")
 
     def _path(self, unit: Unit, suffix: str) -> str:
         return f"{self.root}/{unit.kind}/{unit.name}-{unit.key}{suffix}"
@@ -82,13 +83,17 @@ class Store:
             self.files.put_file(local.name, beside)
         self.files.mv(beside, path)
 
-    def _get(self, path: str, folder: Path) -> None:
+    def _get(self, unit: Unit, work: Path, suffix: str) -> bool:
+        path, folder = self._path(unit, suffix), unit.folder(work)
+        if not self.files.exists(path):
+            return False
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".fetching-") as beside:
             with self.files.open(path, "rb") as file, tarfile.open(fileobj=file, mode="r|") as archive:
                 archive.extractall(f"{beside}/unit", filter="data")
             shutil.rmtree(folder, ignore_errors=True)  # of an earlier session, and behind what was kept since
             shutil.move(f"{beside}/unit", folder)
+        return True
 
 
 def _not_hidden(member: tarfile.TarInfo) -> tarfile.TarInfo | None:

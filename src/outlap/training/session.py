@@ -191,8 +191,8 @@ def _save(run: Run, model: Any, clock: Stopwatch) -> None:
 def _seed_stint(model: Any, config: TrainingConfig) -> None:
     """Let all that is random from here on follow from the run's seed and the steps so far.
 
-    A stint is what is trained from one checkpoint to the next. Each begins with new episodes, and depends on nothing but
-    the checkpoint: a training that is resumed there is, bit for bit, the one that was never stopped.
+    A stint is what is trained from one checkpoint to the next. Each begins with new episodes, and depends on nothing
+    but the checkpoint: a training that is resumed there is, bit for bit, the one that was never stopped.
     """
     model.set_random_seed(int(np.random.SeedSequence([config.seed, model.num_timesteps]).generate_state(1)[0]))
 
