@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import resource
 from pathlib import Path
@@ -13,8 +14,10 @@ from stable_baselines3 import PPO
 
 from outlap.config import load_config
 from outlap.envs.race_config import RaceConfig
+from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.envs.tasks import load_tracks
 from outlap.errors import OutlapError
+from outlap.simulator.simulator import Simulator
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
 from outlap.training.session import Progress, train
@@ -131,6 +134,21 @@ def test_a_full_disk_is_an_error_of_storage_and_what_was_saved_stays() -> None:
     assert {path: path.read_bytes() for path in run.checkpoints()} == kept
     assert not list(run.folder.rglob("*.partial*"))
     assert train(run.config, run.folder, resume=load_run("run")).finished
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_training_gives_its_memory_back_at_once(stopped: bool) -> None:
+    train(SMALL, Path("first"))  # what libraries keep of their import is kept once
+    gc.collect()
+    gc.disable()
+    try:
+        if stopped:
+            stopped_after(256, SMALL, Path("run"))
+        else:
+            train(SMALL, Path("run"))
+        assert not [thing for thing in gc.get_objects() if type(thing) in (SB3VecEnv, PPO, Simulator)]
+    finally:
+        gc.enable()
 
 
 def test_a_finished_run_is_not_trained_further() -> None:

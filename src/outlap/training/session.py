@@ -149,11 +149,12 @@ def train(
         _forget_curve_after(begun_at, run.folder / "tensorboard")
     model.set_logger(configure(str(run.folder / "tensorboard"), ["tensorboard"]))
     clock = Stopwatch(float(run.record().get("seconds", 0.0)) if begun_at else 0.0)
+    watcher = _watcher(run, config, clock, on_progress)
     try:
         if begun_at < config.total_steps:
             model.learn(
                 config.total_steps - begun_at,
-                callback=_watcher(run, config, clock, on_progress),
+                callback=watcher,
                 log_interval=config.log_interval,
                 reset_num_timesteps=begun_at == 0,
             )
@@ -163,6 +164,8 @@ def train(
     except Exception:
         _check_finite(model, run)  # a network that has diverged breaks other things first
         raise
+    finally:
+        watcher.locals = {}  # in which model and watcher hold each other, and all worlds, until garbage is collected
     _check_finite(model, run)
     save_checkpoint(run, model, "policy.zip", "replay.npz")
     run.note_pace(
