@@ -80,6 +80,20 @@ def test_what_was_before_an_episode_changes_nothing() -> None:
     torch.testing.assert_close(z, encoder(encoder.project(steps[2:]), valid[2:], 4))
 
 
+def test_in_bfloat16_the_context_and_its_gradient_are_nearly_the_same() -> None:
+    torch.manual_seed(5)
+    encoder = ContextEncoder(200, 32, 2)
+    steps, weight = torch.randn(8, 64, 200), torch.randn(64, 32)
+    found = []
+    for encoder.in_bfloat16 in (False, True):
+        z = encoder(encoder.project(steps), torch.ones(8, 64), 8)
+        assert z.dtype == torch.float32
+        found.append((z, *torch.autograd.grad((z * weight).sum(), list(encoder.parameters()))))
+    for exact, rounded in zip(*found, strict=True):
+        off = (exact - rounded).norm() / exact.norm()
+        assert 0.0 < off < 0.02
+
+
 def test_a_convolution_without_overlap_is_pytorchs() -> None:
     torch.manual_seed(4)
     ours = ScanConvolution(20, 6)  # 20 beams: 7 are missing to 27

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -184,7 +184,7 @@ class MQL(OffPolicyAlgorithm):
             update_learning_rate(optimizer, rate)
         records: dict[str, list[torch.Tensor]] = defaultdict(list)
         settings = self.settings
-        with _products_in_bfloat16() if policy.trains_in_bfloat16 else nullcontext():
+        with _in_bfloat16(policy):
             for _ in range(gradient_steps):
                 self._n_updates += 1
                 batch = self.draw(self.replay_buffer, batch_size, self._rng, by_task=self.by_task)
@@ -218,11 +218,15 @@ class MQL(OffPolicyAlgorithm):
 
 
 @contextmanager
-def _products_in_bfloat16() -> Iterator[None]:
-    """Matrix products of float32 tensors on a CPU round their factors to bfloat16, where the CPU gains by it."""
-    matmul = torch.backends.mkldnn.matmul  # type: ignore[attr-defined] - not in its stubs
-    before, matmul.fp32_precision = matmul.fp32_precision, "bf16"
+def _in_bfloat16(policy: MQLPolicy) -> Iterator[None]:
+    """Products with the context's inputs are made in bfloat16 if the preset says so, on a CPU that computes with it."""
+    policy.context.in_bfloat16 = policy.trains_in_bfloat16 and policy.device.type == "cpu" and _computes_in_bfloat16()
     try:
         yield
     finally:
-        matmul.fp32_precision = before
+        policy.context.in_bfloat16 = False
+
+
+def _computes_in_bfloat16() -> bool:
+    can = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(can.get("avx512_bf16") or can.get("amx_bf16"))

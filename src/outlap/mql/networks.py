@@ -26,6 +26,7 @@ class ContextEncoder(nn.Module):
     def __init__(self, inputs: int, hidden: int, layers: int) -> None:
         super().__init__()
         self.hidden = hidden
+        self.in_bfloat16 = False  # round the factors of the inputs' products so
         self.inputs = nn.ModuleList(nn.Linear(inputs if i == 0 else hidden, 3 * hidden) for i in range(layers))
         self.recurrent = nn.ModuleList(nn.Linear(hidden, 3 * hidden) for _ in range(layers))
         for parameter in self.parameters():
@@ -33,7 +34,13 @@ class ContextEncoder(nn.Module):
 
     def project(self, steps: Tensor) -> Tensor:
         """The first layer's share of the inputs: (rows, n, inputs) → (rows, n, 3 hidden)."""
-        return self.inputs[0](steps)
+        return self._product(self.inputs[0], steps)
+
+    def _product(self, layer: nn.Module, x: Tensor) -> Tensor:
+        assert isinstance(layer, nn.Linear)
+        if not self.in_bfloat16:
+            return layer(x)
+        return functional.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16()).float()
 
     def forward(self, projected: Tensor, valid: Tensor, length: int, first: Tensor | None = None) -> Tensor:
         """The context z (n, hidden) after the last step of each window.
@@ -50,7 +57,7 @@ class ContextEncoder(nn.Module):
         for layer, (inputs, recurrent) in enumerate(zip(self.inputs, self.recurrent, strict=True)):
             assert isinstance(recurrent, nn.Linear)
             if layer:
-                steps = inputs(steps)
+                steps = self._product(inputs, steps)
             if layer == 1:  # from here on rows are those of the windows
                 rows = first + torch.arange(length, device=first.device).unsqueeze(-1)
                 valid, first = valid[rows, torch.arange(len(first), device=first.device)], zeros
@@ -149,7 +156,7 @@ class Preset:
     hidden: tuple[int, ...] = (256, 256)  # of actor and critics
     layer_norm = False  # in the critics
     shared_encoder = False  # actor, critics and context see through one encoder, which the critics' loss trains
-    trains_in_bfloat16 = False  # products of the meta-training; worth it from a few hundred inputs on
+    trains_in_bfloat16 = False  # the inputs of the context's GRU; worth it from a few hundred on
 
     def context_terms(self, space: gym.spaces.Dict) -> tuple[str, ...]:
         """The observation terms that the context is made of, PREVIOUS_REWARD aside."""
