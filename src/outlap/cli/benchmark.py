@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import platform
 import resource
 import time
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from tyro.conf import FlagCreatePairsOff
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
+from outlap.training.run import machine
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -83,8 +82,7 @@ class BenchmarkSimulator:
             "integrator": self.integrator,
             "timestep_s": 0.01,
             "threads": get_num_threads(),
-            "cores": os.cpu_count(),
-            "machine": platform.platform(),
+            "machine": machine(),
         }
         return CommandResult(data, lambda console: _print(console, rows))
 
@@ -220,7 +218,7 @@ class BenchmarkMQL:
                 with multiprocessing.get_context("spawn").Pool(1) as pool:
                     rows.append(pool.apply(_measure_mql, (self, preset, beams, batch)))
                 update(len(rows), f"{preset}, {beams} beams, batch {batch}")
-        data = {"rows": rows, "device": self.device, "cores": os.cpu_count(), "machine": platform.platform()}
+        data = {"rows": rows, "device": self.device, "machine": machine()}
         return CommandResult(data, lambda console: _print_mql(console, rows))
 
 
@@ -331,7 +329,7 @@ class BenchmarkRacing:
                 measured.wait(0.5)
                 update(int(time.monotonic() - begun), "")
             row = measured.get()
-        data = {"rows": [row], "cores": os.cpu_count(), "machine": platform.platform()}
+        data = {"rows": [row], "machine": machine()}
         return CommandResult(data, lambda console: _print_racing(console, row))
 
 

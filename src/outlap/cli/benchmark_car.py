@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
+from outlap.training.run import machine
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -54,8 +53,7 @@ class BenchmarkCar:
                 if number % 100 == 99:
                     update(number + 1, command.reason)
         milliseconds = {name: round(1000.0 * float(np.quantile(taken, q)), 3) for name, q in QUANTILES.items()}
-        data = {"file": self.file, "commands": self.commands, **milliseconds, "machine": platform.platform()}
-        data["cores"] = os.cpu_count()
+        data = {"file": self.file, "commands": self.commands, **milliseconds, "machine": machine()}
 
         def show(console: Console) -> None:
             words = ", ".join(f"{name.removesuffix('_ms')} {value} ms" for name, value in milliseconds.items())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.cli.races import check_positive
+from outlap.training.run import machine
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,7 +68,7 @@ class BenchmarkViewer:
                 with multiprocessing.get_context("spawn").Pool(1) as pool:
                     row |= pool.apply(measure, (self,))
                 update(number, measure.__name__.removeprefix("_measure_"))
-        data = {**row, "cores": os.cpu_count(), "machine": platform.platform()}
+        data = {**row, "machine": machine()}
         return CommandResult(data, lambda console: _print(console, row))
 
 

@@ -156,7 +156,7 @@ class Preset:
     hidden: tuple[int, ...] = (256, 256)  # of actor and critics
     layer_norm = False  # in the critics
     shared_encoder = False  # actor, critics and context see through one encoder, which the critics' loss trains
-    trains_in_bfloat16 = False  # the inputs of the context's GRU; worth it from a few hundred on
+    trains_in_bfloat16 = False  # the context, in a meta-training; worth it from a few hundred inputs on
 
     def context_terms(self, space: gym.spaces.Dict) -> tuple[str, ...]:
         """The observation terms that the context is made of, PREVIOUS_REWARD aside."""
@@ -190,7 +190,7 @@ class Preset:
 class Paper(Preset):
     """The networks of the paper: its GRU reads whole observations as they are.
 
-    Products in bfloat16 change a gradient by 1 to 2 %; another batch changes it by more than 100 %.
+    The inputs' products in bfloat16 change the context's gradient by 1 to 2 %; another batch by ten times that.
     """
 
     trains_in_bfloat16 = True

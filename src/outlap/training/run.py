@@ -179,8 +179,13 @@ def provenance() -> Mapping[str, Any]:
         "command": " ".join(["outlap", *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
-        "machine": {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()},
+        "machine": machine(),
     }
+
+
+def machine() -> Mapping[str, Any]:
+    """What results were measured on."""
+    return {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()}
 
 
 def _processor() -> str:
