@@ -48,10 +48,8 @@ class Remembering(MemoryFileSystem):
 
     def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
         path = self._strip_protocol(path)
-        if path not in self.dircache:
-            self.dircache[path] = found = super().ls(path, detail=True)
-        else:
-            found = self.dircache[path]
+        found: Any = self.dircache[path] if path in self.dircache else super().ls(path, detail=True)
+        self.dircache[path] = found
         return found if detail else [each["name"] for each in found]
 
     def exists(self, path: str, **_: Any) -> bool:

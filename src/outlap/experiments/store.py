@@ -67,7 +67,8 @@ class Store:
 
     def get_part(self, unit: Unit, work: Path) -> None:
         """Bring what there is of a unit, if anything."""
-        self._get(unit, work, ".tar") or self._get(unit, work, ".part.tar")
+        if not self._get(unit, work, ".tar"):
+            self._get(unit, work, ".part.tar")
 
     def _path(self, unit: Unit, suffix: str) -> str:
         return f"{self.root}/{unit.kind}/{unit.name}-{unit.key}{suffix}"
