@@ -15,7 +15,8 @@ from outlap.cli.output import CommandResult
 class Demo:
     """Meta-train a policy on the built-in training circuits; race it on three that it never saw, adapt, race again.
 
-    The same as `outlap train mql` and `outlap adapt --clip abc` with their defaults, but shorter.
+    The same as `outlap train mql` and `outlap adapt --clip abc` with their defaults, but shorter, and so is the time
+    over which the penalty for crashing grows.
     """
 
     steps: int = 350_000
@@ -45,6 +46,11 @@ class Demo:
 
         settings = {"total_steps": self.steps, "seed": self.seed, "held_out_tracks": BUILTIN_HELD_OUT}
         config = validate(MQLConfig, settings, "outlap demo")
+        # The penalty for crashing grows over the same share of a shorter training.
+        usual = MQLConfig()
+        growth = usual.env.reward.collision_steps * self.steps / usual.total_steps
+        reward = usual.env.reward.model_copy(update={"collision_steps": growth})
+        config = config.model_copy(update={"env": config.env.model_copy(update={"reward": reward})})
         folder = self.out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
         trained = TrainMQL(settings=config, out=folder, quiet=self.quiet).run()
         adapted = Adapt(
