@@ -44,13 +44,15 @@ class Demo:
         from outlap.track.generate import BUILTIN_HELD_OUT
         from outlap.training.mql import MQLConfig
 
-        settings = {"total_steps": self.steps, "seed": self.seed, "held_out_tracks": BUILTIN_HELD_OUT}
-        config = validate(MQLConfig, settings, "outlap demo")
-        # The penalty for crashing grows over the same share of a shorter training.
         usual = MQLConfig()
+        # The penalty for crashing grows over the same share of a shorter training.
         growth = usual.env.reward.collision_steps * self.steps / usual.total_steps
         reward = usual.env.reward.model_copy(update={"collision_steps": growth})
-        config = config.model_copy(update={"env": config.env.model_copy(update={"reward": reward})})
+        env = usual.env.model_copy(update={"reward": reward})
+        settings = {
+            "total_steps": self.steps, "seed": self.seed, "held_out_tracks": BUILTIN_HELD_OUT, "env": env,
+        }  # fmt: skip
+        config = validate(MQLConfig, settings, "outlap demo")
         folder = self.out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
         trained = TrainMQL(settings=config, out=folder, quiet=self.quiet).run()
         adapted = Adapt(
