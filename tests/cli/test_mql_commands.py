@@ -12,6 +12,7 @@ import pytest
 from outlap.cli.main import main
 from outlap.evaluation.metrics import summarise_methods
 from outlap.evaluation.recording import Recording
+from outlap.evaluation.rollout import evaluate
 from synthetic_tracks import ring
 
 SMALL = [
@@ -59,6 +60,36 @@ def test_train_evaluate_and_adapt(run: Path, capfd: pytest.CaptureFixture[str]) 
     assert all(recording.context.shape == (len(recording.time), 32) for recording in recordings)
     assert main(["replay", "adapted", "--out", "adapted.html"]) == 0
     assert main(["plot", "contexts", "adapted", "--out", "contexts.png"]) == 0
+
+
+def test_an_adaptation_goes_on_where_it_was_interrupted(
+    run: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["adapt", "run", "--tracks", "ring6", "--seeds", "2", "--clip", "none", "abc", *SHORT, "--record", "1"]
+    words += ["--time-limit", "2", "--quiet"]
+    assert main([*words, "--out", "whole"]) == 0
+    raced: list[str] = []
+
+    def interrupted_in_the_third(driver, *arguments):
+        raced.append(driver.name)
+        if len(raced) == 3:
+            raise KeyboardInterrupt
+        return evaluate(driver, *arguments)
+
+    monkeypatch.setattr("outlap.evaluation.rollout.evaluate", interrupted_in_the_third)
+    capfd.readouterr()
+    assert main(words) == 130
+    (folder,) = Path("run/adaptations").iterdir()
+    assert f"saved; go on with the same command and --out {folder}\n" in capfd.readouterr()[1]
+    assert main([*words, "--out", str(folder), "--seeds", "3"]) == 2
+    assert "was begun with other settings" in capfd.readouterr()[1]
+    assert main([*words, "--out", str(folder)]) == 0
+    assert raced == ["before", "none", "abc", "abc", "none", "abc"]
+    for name in ("episodes.parquet", "updates.parquet"):
+        pd.testing.assert_frame_equal(pd.read_parquet(folder / name), pd.read_parquet(Path("whole") / name))
+    assert {path.name for path in folder.rglob("*")} == {path.name for path in Path("whole").rglob("*")}
+    assert main([*words, "--out", str(folder)]) == 2
+    assert "must be an empty or a new folder" in capfd.readouterr()[1]
 
 
 def test_wrong_arguments_are_one_line(run: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -79,7 +79,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("command", "flags"), [("evaluate", ["--episodes", "100_000"]), ("adapt", ["--seeds", "10_000", "--record", "1"])]
+    ("command", "flags"), [("evaluate", ["--episodes", "100_000"]), ("adapt", ["--episodes", "100_000"])]
 )
 def test_races_leave_nothing_half_done(
     command: str, flags: list[str], run: Path, commands: Commands, tmp_path: Path
@@ -88,3 +88,22 @@ def test_races_leave_nothing_half_done(
     ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out"), within=1.0)
     check_ended(ended, command, f"{NOTHING_KEPT}\n")
     assert not any(tmp_path.glob("out/*"))  # so that the same command can begin again
+
+
+def test_adaptations_that_are_done_are_kept(run: Path, commands: Commands, tmp_path: Path) -> None:
+    words = [
+        "adapt",
+        str(run),
+        "--tracks",
+        "Foxglove",
+        "--seeds",
+        "10_000",
+        "--iterations",
+        "1",
+        "--collect-steps",
+        "10",
+    ]
+    words += ["--episodes", "2", "--record", "1", "--time-limit", "2", "--out", "out", "--quiet"]
+    ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out/parts/*-episodes.parquet"), 1.0)
+    check_ended(ended, "adapt", "saved; go on with the same command\n")
+    assert leftovers(tmp_path / "out") == []

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import shlex
 import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,13 +24,12 @@ from outlap.cli.recordings import RECORDINGS, record_episodes, with_recordings
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
 
-    from outlap.track import Track
+    from outlap.evaluation.results import Parts
 
 Rule = Literal["abc", "fixed", "none"]
-BEFORE = -1  # in place of an adaptation's seed
+BEFORE, NO_SEED = "before", -1  # in place of a clip rule, and of an adaptation's seed
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class Adapt:
     """Adapt a meta-trained policy to tracks, and race it before and after on the same episodes.
 
     A task is a track with the run's cars, drawn anew in every episode. Every clip rule adapts from the same
-    seeds, each time starting from the meta-policy, which stays as it is.
+    seeds, each time starting from the meta-policy, which stays as it is. Killed or interrupted, the same command with
+    --out of what it had begun goes on there.
     """
 
     run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -83,13 +85,19 @@ class Adapt:
     looked at with `outlap replay`, `outlap video` or `outlap plot`."""
 
     out: Path | None = None
-    """A new or empty folder for the results; by default RUN/adaptations/TIME."""
+    """A new folder for the results, or one in which the same adaptations were begun; by default RUN/adaptations/TIME.
+    """
 
     quiet: FlagCreatePairsOff[bool] = False
     """Show no progress."""
 
     json: str | None = None
     """Write the result as JSON to this file; - for standard output."""
+
+    def _asked(self) -> dict[str, Any]:
+        """What decides the results, for the same command to be told from another."""
+        aside = ("run_folder", "out", "quiet", "json")
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in aside}
 
     def run(self) -> CommandResult:
         import pandas as pd
@@ -99,7 +107,7 @@ class Adapt:
         from outlap.envs.tasks import load_tracks
         from outlap.envs.terminations import CRASH
         from outlap.evaluation.metrics import summarise_methods
-        from outlap.evaluation.results import prepare_folder, save_results, write_rows
+        from outlap.evaluation.results import UPDATES, Parts, save_results, write_rows
         from outlap.evaluation.rollout import evaluate, standing_starts
         from outlap.mql.adaptation import AdaptationSettings, adapt
         from outlap.mql.mql import MQL
@@ -118,58 +126,66 @@ class Adapt:
         meta = MQL.load(run.policy_path, device=run.config.device)
         meta.load_replay_buffer(run.replay_path)
         folder = self.out or unused(run.folder / "adaptations" / time.strftime("%Y%m%d-%H%M%S"))
-        prepare_folder(folder)
+        fingerprints = {track.name: track.fingerprint for track in tracks}
+        digest = hashlib.sha256(run.policy_path.read_bytes()).hexdigest()
+        parts = Parts(folder, {**self._asked(), "tracks": fingerprints, "policy": digest})
         races = standing_starts(run.config.env, tracks, 0, self.time_limit)
         collecting = run.config.env.model_copy(update={"augment_tracks": False})
         base = AdaptationSettings(
             iterations=self.iterations, collect_steps=self.collect_steps, on_task_steps=self.on_task_steps,
             replay_steps=self.replay_steps, learning_rate=self.learning_rate,
         )  # fmt: skip
-        rows: list[pd.DataFrame] = []
-        updates: list[pd.DataFrame] = []
-        total = len(tracks) * (1 + self.seeds * len(self.clip))
-        with _kept_whole_or_not_at_all(folder), progress_bar("adapting", total, "policies", self.quiet) as update:
-
-            def race(policy: Any, track: Track, method: str, seed: int) -> None:
-                driver = PolicyDriver(policy, scale_observations=races.scale_observations, name=method)
-                raced = evaluate(driver, races, [track], self.episodes, self.seed)
-                rows.append(raced.assign(method=method, adaptation_seed=seed))
-                if seed in (BEFORE, self.seed):
-                    number = min(self.record, self.episodes)
-                    suffix = f"-{self.clip.index(method) + 1 if method in self.clip else 0}-{method}"  # in their order
-                    record_episodes(driver, races, track, self.seed, number, folder / RECORDINGS, method, suffix)
-                update(len(rows), f"{method} on {track.name}: {(raced['outcome'] == CRASH).mean():.1%} crashes")
-
-            for track in tracks:
-                race(meta, track, "before", BEFORE)
-                for seed in range(self.seed, self.seed + self.seeds):
-                    for rule in self.clip:
+        seeds = range(self.seed, self.seed + self.seeds)
+        methods = [(BEFORE, NO_SEED), *((rule, seed) for seed in seeds for rule in self.clip)]
+        policies = [(track, method, seed) for track in tracks for method, seed in methods]
+        with (
+            _kept(parts, folder, self.out is None),
+            progress_bar("adapting", len(policies), "policies", self.quiet) as update,
+        ):
+            for number, (track, method, seed) in enumerate(policies):
+                if not parts.has(number):
+                    policy, updates = meta, None
+                    if method != BEFORE:
                         task = SB3VecEnv(self.collect_worlds, **{**dict(collecting), "tracks": [track]})
                         task.seed(10_000 + seed)
-                        adapted, record = adapt(meta, task, replace(base, clip=CLIP_RULES[rule]()), seed=seed)
-                        updates.append(pd.DataFrame(record.updates).assign(method=rule, seed=seed, track=track.name))
-                        race(adapted, track, rule, seed)
-        everything = pd.concat(rows, ignore_index=True)
+                        policy, record = adapt(meta, task, replace(base, clip=CLIP_RULES[method]()), seed=seed)
+                        updates = pd.DataFrame(record.updates).assign(method=method, seed=seed, track=track.name)
+                    driver = PolicyDriver(policy, scale_observations=races.scale_observations, name=method)
+                    raced = evaluate(driver, races, [track], self.episodes, self.seed)
+                    if seed in (NO_SEED, self.seed):
+                        recorded = min(self.record, self.episodes)
+                        suffix = f"-{methods.index((method, seed))}-{method}"
+                        place = folder / RECORDINGS
+                        record_episodes(driver, races, track, self.seed, recorded, place, method, suffix)
+                    parts.put(number, raced.assign(method=method, adaptation_seed=seed), updates)
+                crashes = (parts.rows(number)["outcome"] == CRASH).mean()
+                update(number + 1, f"{method} on {track.name}: {crashes:.1%} crashes")
+        everything = parts.all_rows()
         summary = summarise_methods(everything)
-        record = {**provenance(), "settings": self, "tracks": {track.name: track.fingerprint for track in tracks}}
-        save_results(folder, everything, summary, record)
-        write_rows(pd.concat(updates, ignore_index=True), folder / "updates.parquet")
+        write_rows(parts.all_updates(), folder / UPDATES)
+        save_results(folder, everything, summary, {**provenance(), "settings": self, "tracks": fingerprints})
+        parts.remove()
         data = {**summary, "folder": folder}
         result = CommandResult(data, lambda console: _print(console, data))
         return with_recordings(result, folder, tracks[0]) if self.record else result
 
 
 @contextmanager
-def _kept_whole_or_not_at_all(folder: Path) -> Iterator[None]:
-    """Empties a folder again if the block does not come to its end: so the same command can begin anew."""
+def _kept(parts: Parts, folder: Path, unnamed: bool) -> Iterator[None]:
+    """If the block does not come to its end, says what is kept and how to go on; empties a folder without any part."""
     try:
         yield
     except BaseException as error:
-        shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
-        with suppress(OSError):
-            folder.rmdir()
-        if isinstance(error, KeyboardInterrupt):
-            print(f"\n{NOTHING_KEPT}", file=sys.stderr)
+        if parts.has(0):
+            place = f" and --out {shlex.quote(str(folder))}" if unnamed else ""
+            print(f"\nsaved; go on with the same command{place}", file=sys.stderr)
+        else:
+            parts.remove()
+            shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
+            with suppress(OSError):
+                folder.rmdir()
+            if isinstance(error, KeyboardInterrupt):
+                print(f"\n{NOTHING_KEPT}", file=sys.stderr)
         raise
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import io
+import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from outlap.errors import OutlapError
-from outlap.files import atomic_write, make_folder, to_json
+from outlap.files import atomic_write, make_folder, remove_partials, to_json
 
-ROWS, SUMMARY, RECORD = "episodes.parquet", "summary.json", "evaluation.json"
+ROWS, UPDATES, SUMMARY, RECORD = "episodes.parquet", "updates.parquet", "summary.json", "evaluation.json"
 
 
 def prepare_folder(folder: Path) -> None:
@@ -44,3 +46,60 @@ def write_rows(rows: pd.DataFrame, path: Path) -> None:
     buffer = io.BytesIO()
     rows.to_parquet(buffer, index=False)
     atomic_write(path, buffer.getvalue())
+
+
+class Parts:
+    """Results that come one after another, each kept when it is there: after a kill only what is missing is done."""
+
+    def __init__(self, folder: Path, asked: Mapping[str, Any]) -> None:
+        """Begin in a new folder, or go on in one where the same was begun.
+
+        Args:
+            folder: of the evaluation.
+            asked: all that the results depend on.
+
+        Raises OutlapError where something else is in the folder, or nothing can be written.
+        """
+        self.folder = folder / "parts"
+        path, content = self.folder / "asked.json", to_json(asked) + "\n"
+        if path.is_file():
+            if path.read_text() != content:
+                raise OutlapError(f"{folder}: was begun with other settings ({path}); give those, or another --out")
+            remove_partials(folder)
+        else:
+            with suppress(OSError):
+                self.folder.rmdir()  # of one that was killed in its first moment
+            prepare_folder(folder)
+            atomic_write(path, content)
+
+    def has(self, number: int) -> bool:
+        """Whether a part is done."""
+        return self._path(number, ROWS).is_file()
+
+    def put(self, number: int, rows: pd.DataFrame, updates: pd.DataFrame | None) -> None:
+        """Keep a part: rows of episodes, and of the updates before them if there were any."""
+        if updates is not None:
+            write_rows(updates, self._path(number, UPDATES))
+        write_rows(rows, self._path(number, ROWS))
+
+    def rows(self, number: int) -> pd.DataFrame:
+        """Rows of episodes of a part."""
+        return pd.read_parquet(self._path(number, ROWS))
+
+    def all_rows(self) -> pd.DataFrame:
+        """Rows of episodes of all parts, in their order."""
+        return self._all(ROWS)
+
+    def all_updates(self) -> pd.DataFrame:
+        """Rows of updates of all parts, in their order."""
+        return self._all(UPDATES)
+
+    def remove(self) -> None:
+        """Remove all parts: the whole is written, or there is none."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, number: int, name: str) -> Path:
+        return self.folder / f"{number:06d}-{name}"
+
+    def _all(self, name: str) -> pd.DataFrame:
+        return pd.concat([pd.read_parquet(path) for path in sorted(self.folder.glob(f"*-{name}"))], ignore_index=True)
