@@ -61,6 +61,26 @@ def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_
         torch.testing.assert_close(gru(projected, valid, first, length, weight, bias), found, atol=0.0, rtol=0.0)
 
 
+def test_products_in_bfloat16_change_little() -> None:
+    torch.manual_seed(3)
+    n, hidden, rows, length = 64, 128, 11, 10
+    projected, upstream = torch.randn(rows, n, 3 * hidden).bfloat16().float(), torch.randn(length, n, hidden)
+    valid = (torch.arange(rows)[:, None] >= torch.randint(0, 4, (n,))).float()
+    first = torch.randint(0, 2, (n,))
+    weight, bias = torch.randn(3 * hidden, hidden) / hidden**0.5, torch.randn(3 * hidden)
+    found = []
+    for dtype in (torch.float32, torch.bfloat16):
+        given = [tensor.clone().requires_grad_() for tensor in (projected.to(dtype), weight, bias)]
+        states = gru(given[0], valid, first, length, given[1], given[2])
+        assert states.dtype == torch.float32
+        gradients = torch.autograd.grad((states * upstream).sum(), given)
+        assert [gradient.dtype for gradient in gradients] == [dtype, torch.float32, torch.float32]
+        found.append([states.detach(), *(gradient.float() for gradient in gradients)])
+    for exact, rounded in zip(*found, strict=True):
+        change = torch.linalg.vector_norm(rounded - exact) / torch.linalg.vector_norm(exact)
+        assert 0.0 < change < 2.0**-7  # a factor is rounded by at most 2^-9 of it
+
+
 def test_gates_saturate_where_inputs_are_huge_and_hide_no_nan() -> None:
     inputs = torch.tensor([-1e30, -30.0, 0.0, 30.0, 1e30, float("nan")])
     projected = inputs[None, :, None].expand(1, 6, 3)

@@ -298,17 +298,16 @@ class HistoryBuffer:
         return path
 
     def _read(self, path: np.ndarray, terms: Sequence[str]) -> Windows:
-        rows = path % self.capacity
-        missing = path == NONE
-        action, reward = self.action[rows], self.reward[rows]
-        action[missing] = 0.0
-        reward[missing] = 0.0
-        observation = {}
-        for name in terms:
-            values = self.observation[name].take(rows, axis=0)
+        by_step = path.T  # as a network goes through them, so that none of it need be copied for that
+        rows, missing = by_step % self.capacity, by_step == NONE
+
+        def read(column: np.ndarray) -> np.ndarray:
+            values = column.take(rows, axis=0)
             values[missing] = 0.0
-            observation[name] = values
-        return Windows(observation, action, reward, ~missing)
+            return values.swapaxes(0, 1)
+
+        observation = {name: read(self.observation[name]) for name in terms}
+        return Windows(observation, read(self.action), read(self.reward), ~missing.T)
 
     def _add(self, worlds, observation, action, reward, terminated, before, tasks) -> None:
         serial = self.added + np.arange(len(worlds))

@@ -6,11 +6,15 @@ separate tensor operations those passes would take longer than the products.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
-from numba import njit
+from numba import cfunc, njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from outlap.mql.torch_threads import BLOCK, ROW_LOOP, RowLoop, bfloats, floats, integers, load, store, take
 
 
 def gru(projected: Tensor, valid: Tensor, first: Tensor, length: int, weight: Tensor, bias: Tensor) -> Tensor:
@@ -28,8 +32,8 @@ def gru(projected: Tensor, valid: Tensor, first: Tensor, length: int, weight: Te
         weight: (3 hidden, hidden) and
         bias: (3 hidden,) of the recurrent product.
     """
-    if projected.device.type == "cpu" and projected.dtype == torch.float32:
-        given = projected.contiguous(), valid.contiguous(), first, length, weight, bias
+    if projected.device.type == "cpu" and projected.dtype in _STEPS:
+        given = projected.contiguous(), valid.float().contiguous(), first.contiguous(), length, weight, bias
         states = GRULayer.apply(*given, torch.is_grad_enabled())
         assert isinstance(states, Tensor)
         return states
@@ -55,7 +59,10 @@ def _gru_of_operations(
 
 
 class GRULayer(torch.autograd.Function):
-    """`gru` for float32 on a CPU; `projected` and `valid` are contiguous."""
+    """`gru` on a CPU; `projected` and `valid` are contiguous.
+
+    With `projected` in bfloat16 the factors of all products are, and what is summed over steps stays float32.
+    """
 
     @staticmethod
     def forward(
@@ -71,45 +78,65 @@ class GRULayer(torch.autograd.Function):
         """See `gru`; `with_grad`: keep what `backward` needs."""
         n, hidden = projected.shape[1], weight.shape[1]
         kept = length if with_grad else 1
-        gates = projected.new_empty(kept, n, 3 * hidden)  # r, u and the recurrent product's share of c
-        candidates = projected.new_empty(kept, n, hidden)
-        states = projected.new_zeros(length + 1, n, hidden)
+        gates = valid.new_empty(kept, n, 3 * hidden)  # r, u and the recurrent product's share of c
+        candidates = valid.new_empty(kept, n, hidden)
+        states = valid.new_zeros(length + 1, n, hidden)
+        rounds = projected.dtype != states.dtype
+        factors = states.to(projected.dtype) if rounds else states  # of products
+        weight = weight.to(projected.dtype)
         transposed = weight.t()
-        given = _flat(projected.detach(), valid, first, states)
+        product = projected.new_empty(n, 3 * hidden) if rounds else gates  # in place where nothing is rounded
+        step = RowLoop(
+            _STEPS[projected.dtype], n, hidden, kept, valid, first, states, gates, candidates, bias,
+            projected, product, factors,
+        )  # fmt: skip
         for t in range(length):
-            here = gates[t % kept]
-            torch.addmm(bias, states[t], transposed, out=here)
-            _step(_u8(t), _u8(n), _u8(hidden), *given, *_flat(here, candidates[t % kept]))
+            here = product if rounds else gates[t % kept]
+            if t:
+                torch.mm(factors[t], transposed, out=here)
+            else:
+                here.zero_()  # as the state is
+            step(t)
         if with_grad:
-            ctx.save_for_backward(projected, valid, first, gates, candidates, states, weight)
+            ctx.save_for_backward(projected, valid, first, gates, candidates, states, factors, weight)
         return states[1:]
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor):
-        projected, valid, first, gates, candidates, states, weight = ctx.saved_tensors
-        (grad_states,) = grads
-        length, n, hidden = grad_states.shape
-        grad = torch.zeros_like(projected)
-        recurrent = torch.empty_like(gates)  # the gradient of the recurrent products
-        back = torch.zeros_like(states[0])
-        given = _flat(valid, first, gates, candidates, states, grad_states.contiguous(), back, grad, recurrent)
+        projected, valid, first, gates, candidates, states, factors, weight = ctx.saved_tensors
+        arrived = grads[0].contiguous()
+        length, n, hidden = arrived.shape
+        grad = torch.empty_like(projected)
+        spare = len(projected) - length  # rows at either end that are not in every window
+        for outside in (grad[:spare], grad[len(grad) - spare :]):
+            outside.zero_()
+        recurrent = grad.new_empty(length, n, 3 * hidden)  # the gradient of the recurrent products
+        back = torch.zeros_like(arrived[0])
+        rounds = projected.dtype != back.dtype
+        product = grad.new_zeros(n, hidden) if rounds else back
+        own = torch.empty_like(gates[0])
+        step_back = RowLoop(
+            _STEPS_BACK[projected.dtype], n, hidden, valid, first, gates, candidates, states, arrived, back,
+            product, grad, recurrent, own,
+        )  # fmt: skip
         for t in reversed(range(length)):
-            _step_back(_u8(t), _u8(n), _u8(hidden), *given)
-            back.addmm_(recurrent[t], weight)
-        flat = recurrent.view(-1, 3 * hidden)
-        return grad, None, None, None, flat.t() @ states[:-1].view(-1, hidden), flat.sum(0), None
-
-
-def _flat(*tensors: Tensor) -> list[np.ndarray]:
-    return [tensor.view(-1).numpy() for tensor in tensors]
+            step_back(t)
+            if t and rounds:
+                torch.mm(recurrent[t], weight, out=product)
+            elif t:
+                back.addmm_(recurrent[t], weight)
+        of_weight = recurrent[1:].view(-1, 3 * hidden).t() @ factors[1:-1].view(-1, hidden)
+        of_bias = recurrent.sum((0, 1), dtype=arrived.dtype)
+        return grad, None, None, None, of_weight.to(arrived.dtype), of_bias, None
 
 
 _f4, _u8 = np.float32, np.uint64
 _2, _3 = _u8(2), _u8(3)
+_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
+@njit(**_OPTIONS)
 def _tanh(x):
     """Lambert's continued fraction to its seventh term at x / 2, and tanh 2y = 2 tanh y / (1 + tanh² y): to 1e-7.
 
@@ -124,45 +151,103 @@ def _tanh(x):
     return _f4(2) * a * b / (a * a + b * b)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _step(t, n, hidden, projected, valid, first, states, gates, candidates):
-    """Everything of step `t` behind its product, which is in `gates`.
+# Loops are vectorised because arrays are flat, few to a loop, and all whole numbers unsigned.
 
-    It is vectorised because the arrays are flat, few to a loop, and all whole numbers unsigned.
+
+@njit(**_OPTIONS)
+def _step(given, projected, product, factors):
+    """Everything of a step behind its product; `factors` are the states as the next product reads them.
+
+    Where nothing is rounded, both are none: the product is in `gates`, and the states are read as they are.
     """
-    for i in range(n):
-        row = n * (_u8(first[i]) + t) + i
-        x, g, c, h = _3 * hidden * row, _3 * hidden * i, hidden * i, hidden * (n * t + i)
-        for j in range(_2 * hidden):
-            gates[g + j] = _f4(0.5) + _f4(0.5) * _tanh(_f4(0.5) * (projected[x + j] + gates[g + j]))
-        u, p, x, after, keep = g + hidden, g + _2 * hidden, x + _2 * hidden, h + n * hidden, valid[row]
-        for j in range(hidden):
-            candidates[c + j] = _tanh(projected[x + j] + gates[g + j] * gates[p + j])
-        for j in range(hidden):
-            states[after + j] = gates[u + j] * (states[h + j] - candidates[c + j])
-        for j in range(hidden):
-            states[after + j] = keep * (candidates[c + j] + states[after + j])
+    n, t, hidden, kept = given[1], given[2], given[3], given[4]
+    valid, first, states = floats(given[5]), integers(given[6]), floats(given[7])
+    gates, candidates, bias = floats(given[8]), floats(given[9]), floats(given[10])
+    begin = take(given)
+    while begin < n:
+        for i in range(begin, min(begin + _u8(BLOCK), n)):
+            row, here, at = n * (_u8(first[i]) + t) + i, n * t + i, n * (t % kept) + i
+            x, m, h, keep = _3 * hidden * row, _3 * hidden * i, hidden * here, valid[row]
+            g, c, after = _3 * hidden * at, hidden * at, h + n * hidden
+            if product is not None:
+                for j in range(_3 * hidden):
+                    gates[g + j] = load(product, m + j)
+            for j in range(_3 * hidden):
+                gates[g + j] += bias[j]
+            for j in range(_2 * hidden):
+                gates[g + j] = _f4(0.5) + _f4(0.5) * _tanh(_f4(0.5) * (load(projected, x + j) + gates[g + j]))
+            u, p, x = g + hidden, g + _2 * hidden, x + _2 * hidden
+            for j in range(hidden):
+                candidates[c + j] = _tanh(load(projected, x + j) + gates[g + j] * gates[p + j])
+            for j in range(hidden):
+                states[after + j] = gates[u + j] * (states[h + j] - candidates[c + j])
+            for j in range(hidden):
+                states[after + j] = keep * (candidates[c + j] + states[after + j])
+            if factors is not None:
+                for j in range(hidden):
+                    store(factors, after + j, states[after + j])
+        begin = take(given)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _step_back(t, n, hidden, valid, first, gates, candidates, states, arrived, back, grad, recurrent):
-    """The gradient of step `t` in front of its product; `back` becomes what passes it by, without the product."""
-    for i in range(n):
-        row, here = n * (_u8(first[i]) + t) + i, n * t + i
-        b, h, r, to_r = hidden * i, hidden * here, _3 * hidden * here, _3 * hidden * row
-        u, p, to_u, to_c, keep = r + hidden, r + _2 * hidden, to_r + hidden, to_r + _2 * hidden, valid[row]
-        for j in range(hidden):
-            back[b + j] = keep * (back[b + j] + arrived[h + j])
-        for j in range(hidden):
-            grad[to_c + j] = back[b + j] * (_f4(1) - candidates[h + j] * candidates[h + j])
-        for j in range(hidden):
-            grad[to_u + j] = back[b + j] * (states[h + j] - candidates[h + j])
-        for j in range(hidden):
-            grad[to_u + j] *= gates[u + j] * (_f4(1) - gates[u + j])
-            grad[to_c + j] *= _f4(1) - gates[u + j]
-            back[b + j] *= gates[u + j]
-        for j in range(hidden):
-            recurrent[p + j] = grad[to_c + j] * gates[r + j]
-            grad[to_r + j] = grad[to_c + j] * gates[p + j] * gates[r + j] * (_f4(1) - gates[r + j])
-        for j in range(_2 * hidden):
-            recurrent[r + j] = grad[to_r + j]
+@njit(**_OPTIONS)
+def _step_back(given, product, grad, own, recurrent):
+    """The gradient of a step in front of its product; `back` becomes what passes it by, without the product.
+
+    Where nothing is rounded, `product` and `grad` are none: the product is in `back`, and `own` is the gradient.
+    """
+    n, t, hidden = given[1], given[2], given[3]
+    valid, first, gates, candidates = floats(given[4]), integers(given[5]), floats(given[6]), floats(given[7])
+    states, arrived, back = floats(given[8]), floats(given[9]), floats(given[10])
+    begin = take(given)
+    while begin < n:
+        for i in range(begin, min(begin + _u8(BLOCK), n)):
+            row, here = n * (_u8(first[i]) + t) + i, n * t + i
+            b, h, r, to, keep = hidden * i, hidden * here, _3 * hidden * here, _3 * hidden * row, valid[row]
+            to_r = to if grad is None else _3 * hidden * i
+            u, p, to_u, to_c = r + hidden, r + _2 * hidden, to_r + hidden, to_r + _2 * hidden
+            if product is not None:
+                for j in range(hidden):
+                    back[b + j] += load(product, b + j)
+            for j in range(hidden):
+                back[b + j] = keep * (back[b + j] + arrived[h + j])
+            for j in range(hidden):
+                own[to_c + j] = back[b + j] * (_f4(1) - candidates[h + j] * candidates[h + j])
+            for j in range(hidden):
+                own[to_u + j] = back[b + j] * (states[h + j] - candidates[h + j])
+            for j in range(hidden):
+                own[to_u + j] *= gates[u + j] * (_f4(1) - gates[u + j])
+                own[to_c + j] *= _f4(1) - gates[u + j]
+                back[b + j] *= gates[u + j]
+            for j in range(hidden):
+                store(recurrent, p + j, own[to_c + j] * gates[r + j])
+                own[to_r + j] = own[to_c + j] * gates[p + j] * gates[r + j] * (_f4(1) - gates[r + j])
+            for j in range(_2 * hidden):
+                store(recurrent, r + j, own[to_r + j])
+            if grad is not None:
+                for j in range(_3 * hidden):
+                    store(grad, to + j, own[to_r + j])
+        begin = take(given)
+
+
+@cfunc(ROW_LOOP, **_OPTIONS)
+def _step_float32(given):
+    _step(given, floats(given[11]), None, None)
+
+
+@cfunc(ROW_LOOP, **_OPTIONS)
+def _step_bfloat16(given):
+    _step(given, bfloats(given[11]), bfloats(given[12]), bfloats(given[13]))
+
+
+@cfunc(ROW_LOOP, **_OPTIONS)
+def _step_back_float32(given):
+    _step_back(given, None, None, floats(given[12]), floats(given[13]))
+
+
+@cfunc(ROW_LOOP, **_OPTIONS)
+def _step_back_bfloat16(given):
+    _step_back(given, bfloats(given[11]), bfloats(given[12]), floats(given[14]), bfloats(given[13]))
+
+
+_STEPS = {torch.float32: _step_float32, torch.bfloat16: _step_bfloat16}
+_STEPS_BACK = {torch.float32: _step_back_float32, torch.bfloat16: _step_back_bfloat16}
