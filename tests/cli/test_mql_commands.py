@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from filelock import FileLock
 
 from outlap.cli.main import main
 from outlap.evaluation.metrics import summarise_methods
@@ -80,10 +81,15 @@ def test_an_adaptation_goes_on_where_it_was_interrupted(
     capfd.readouterr()
     assert main(words) == 130
     (folder,) = Path("run/adaptations").iterdir()
-    assert f"saved; go on with the same command and --out {folder}\n" in capfd.readouterr()[1]
+    again = "outlap adapt run --tracks ring6 --clip none abc --seeds 2 --iterations 1 --collect-steps 10"
+    again += f" --collect-worlds 2 --replay-steps 2 --episodes 3 --time-limit 2.0 --record 1 --out {folder}"
+    assert f"saved; go on with: {again}\n" in capfd.readouterr()[1]
     assert main([*words, "--out", str(folder), "--seeds", "3"]) == 2
     assert "was begun with other settings" in capfd.readouterr()[1]
-    assert main([*words, "--out", str(folder)]) == 0
+    with FileLock(folder / "parts" / ".lock"):
+        assert main([*words, "--out", str(folder)]) == 2
+    assert "another process is at work there" in capfd.readouterr()[1]
+    assert main([*again.split()[1:], "--quiet"]) == 0
     assert raced == ["before", "none", "abc", "abc", "none", "abc"]
     for name in ("episodes.parquet", "updates.parquet"):
         pd.testing.assert_frame_equal(pd.read_parquet(folder / name), pd.read_parquet(Path("whole") / name))

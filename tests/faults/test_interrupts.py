@@ -105,5 +105,5 @@ def test_adaptations_that_are_done_are_kept(run: Path, commands: Commands, tmp_p
     ]
     words += ["--episodes", "2", "--record", "1", "--time-limit", "2", "--out", "out", "--quiet"]
     ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out/parts/*-episodes.parquet"), 1.0)
-    check_ended(ended, "adapt", "saved; go on with the same command\n")
+    check_ended(ended, "adapt", f"saved; go on with: outlap adapt {run} ")
     assert leftovers(tmp_path / "out") == []

@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -109,3 +110,21 @@ def test_a_training_that_is_killed_twice(algorithm: str, commands: Commands, tmp
     np.testing.assert_array_equal(weights(final), weights(undisturbed))
     assert read_learning(final.folder).equals(read_learning(undisturbed.folder))
     check_whole(final)
+
+
+def test_adaptations_that_are_killed_end_with_the_same_rows(commands: Commands, tmp_path: Path) -> None:
+    run, killed, whole = (str(tmp_path / name) for name in ("run", "killed", "whole"))
+    assert main(["train", "mql", *ENV, *TINY["mql"], "--out", run]) == 0
+    words = ["adapt", run, "--tracks", "Foxglove", "--seeds", "2", "--clip", "none", "abc", "--episodes", "3"]
+    words += ["--iterations", "2", "--collect-steps", "10", "--time-limit", "2", "--quiet"]
+    for part in ("000000", "000002"):
+        commands.ended_by(
+            signal.SIGKILL, [*words, "--out", killed], tmp_path,
+            lambda part=part: (tmp_path / "killed" / "parts" / f"{part}-episodes.parquet").exists(), within=0.3,
+        )  # fmt: skip
+    torch.set_num_threads(1)  # as those that were killed had
+    assert main([*words, "--out", killed]) == 0
+    assert main([*words, "--out", whole]) == 0
+    for name in ("episodes.parquet", "updates.parquet"):
+        pd.testing.assert_frame_equal(pd.read_parquet(f"{killed}/{name}"), pd.read_parquet(f"{whole}/{name}"))
+    assert sorted(path.name for path in Path(killed).iterdir()) == sorted(path.name for path in Path(whole).iterdir())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -40,9 +42,10 @@ def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int,
 
 
 @pytest.mark.parametrize("length", [1, 4])
-def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_too(length: int) -> None:
+@pytest.mark.parametrize("n", [19, 300])  # for one thread, and for two
+def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_too(length: int, n: int) -> None:
     torch.manual_seed(1)
-    n, hidden, rows = 19, 21, 6  # neither a multiple of the lanes of a register
+    hidden, rows = 21, 6  # no multiple of the lanes of a register
     projected = (4.0 * torch.randn(rows, n, 3 * hidden)).requires_grad_()
     valid = (torch.arange(rows)[:, None] >= torch.randint(0, 4, (n,))).float()
     first = torch.randint(0, rows - length + 1, (n,))
@@ -61,9 +64,10 @@ def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_
         torch.testing.assert_close(gru(projected, valid, first, length, weight, bias), found, atol=0.0, rtol=0.0)
 
 
-def test_products_in_bfloat16_change_little() -> None:
+@pytest.mark.parametrize(("n", "hidden", "length"), [(64, 128, 10), (300, 21, 10), (64, 32, 1)])
+def test_products_in_bfloat16_change_little(n: int, hidden: int, length: int) -> None:
     torch.manual_seed(3)
-    n, hidden, rows, length = 64, 128, 11, 10
+    rows = length + 1
     projected, upstream = torch.randn(rows, n, 3 * hidden).bfloat16().float(), torch.randn(length, n, hidden)
     valid = (torch.arange(rows)[:, None] >= torch.randint(0, 4, (n,))).float()
     first = torch.randint(0, 2, (n,))
@@ -76,9 +80,33 @@ def test_products_in_bfloat16_change_little() -> None:
         gradients = torch.autograd.grad((states * upstream).sum(), given)
         assert [gradient.dtype for gradient in gradients] == [dtype, torch.float32, torch.float32]
         found.append([states.detach(), *(gradient.float() for gradient in gradients)])
+        with torch.no_grad():
+            torch.testing.assert_close(gru(given[0], valid, first, length, *given[1:]), states, atol=0.0, rtol=0.0)
     for exact, rounded in zip(*found, strict=True):
-        change = torch.linalg.vector_norm(rounded - exact) / torch.linalg.vector_norm(exact)
-        assert 0.0 < change < 2.0**-7  # a factor is rounded by at most 2^-9 of it
+        change = torch.linalg.vector_norm(rounded - exact)
+        assert change <= 2.0**-7 * torch.linalg.vector_norm(exact)  # a factor is rounded by at most 2^-9 of it
+        assert length == 1 or change > 0.0  # where there are products
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_context_does_not_depend_on_the_types_of_what_is_given(number: int) -> None:
+    torch.manual_seed(4)
+    exact = ContextEncoder(7, 5, number)
+    rounded = copy.deepcopy(exact).bfloat16()
+    steps, valid, first = torch.randn(6, 4, 7), torch.ones(6, 4), torch.tensor([0, 1, 1, 0])
+    z = exact(exact.project(steps), valid, 5, first)
+    assert rounded(rounded.project(steps.bfloat16()), valid.bool(), 5, first.int()).dtype == torch.bfloat16
+    torch.testing.assert_close(
+        rounded(rounded.project(steps.bfloat16()), valid.bool(), 5, first.int()).float(), z, atol=0.03, rtol=0.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "length", "mask"), [([0, 2], 4, (5, 2)), ([-1, 0], 4, (5, 2)), ([0, 0], 6, (5, 2)), ([0, 0], 4, (1, 2))]
+)
+def test_windows_that_leave_the_rows_are_refused(first: list[int], length: int, mask: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="do not fit"):
+        gru(torch.zeros(5, 2, 9), torch.ones(mask), torch.tensor(first), length, torch.zeros(9, 3), torch.zeros(9))
 
 
 def test_gates_saturate_where_inputs_are_huge_and_hide_no_nan() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -63,6 +64,11 @@ def test_every_row_is_gone_through_once_in_every_step(rows: int, number: int) ->
     torch.testing.assert_close(total, weight * float(sum(range(50))), atol=0.0, rtol=0.0)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="PyTorch brings other threads")
+def test_pytorchs_own_threads_are_found() -> None:
+    assert torch_threads._parallel() is not None
+
+
 @pytest.mark.usefixtures("threads")
 def test_without_pytorchs_openmp_one_thread_does_it_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch_threads, "_parallel", lambda: None)
@@ -83,6 +89,7 @@ def test_bfloat16_is_rounded_as_pytorch_does() -> None:
     torch.testing.assert_close(rounded, exact.bfloat16().float(), atol=0.0, rtol=0.0, equal_nan=True)
 
 
-def test_what_is_not_contiguous_is_refused() -> None:
-    with pytest.raises(ValueError, match="contiguous"):
-        RowLoop(add_step_times_weight, 4, torch.zeros(4, 2)[:, 0], torch.arange(4))
+@pytest.mark.parametrize("total", [torch.zeros(4, 2)[:, 0], torch.zeros(4, dtype=torch.float64)])
+def test_what_a_kernel_cannot_read_is_refused(total: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match=r"contiguous tensors of the CPU, of torch\.float32"):
+        RowLoop(add_step_times_weight, 4, total, torch.arange(4))

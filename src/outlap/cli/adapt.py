@@ -94,10 +94,37 @@ class Adapt:
     json: str | None = None
     """Write the result as JSON to this file; - for standard output."""
 
-    def _asked(self) -> dict[str, Any]:
-        """What decides the results, for the same command to be told from another."""
+    def _settings(self) -> dict[str, Any]:
+        """Flags that the results depend on."""
         aside = ("run_folder", "out", "quiet", "json")
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in aside}
+
+    @contextmanager
+    def _kept(self, parts: Parts, folder: Path) -> Iterator[None]:
+        """After Ctrl-C, say how to go on; without any part, empty the folder, so that the same command can begin."""
+        try:
+            yield
+        except BaseException as error:
+            again = f"saved; go on with: {self._again(folder)}"
+            parts.close()
+            if not parts.has(0):
+                parts.remove()
+                shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
+                with suppress(OSError):
+                    folder.rmdir()
+                again = NOTHING_KEPT
+            if isinstance(error, KeyboardInterrupt):
+                print(f"\n{again}", file=sys.stderr)
+            raise
+
+    def _again(self, folder: Path) -> str:
+        """The command that goes on in a folder."""
+        words = ["outlap", "adapt", str(self.run_folder)]
+        for name, value in self._settings().items():
+            if value != getattr(Adapt, name):
+                values = value if isinstance(value, tuple) else (value,)
+                words += [f"--{name.replace('_', '-')}", *map(str, values)]
+        return shlex.join([*words, "--out", str(folder)])
 
     def run(self) -> CommandResult:
         import pandas as pd
@@ -127,8 +154,6 @@ class Adapt:
         meta.load_replay_buffer(run.replay_path)
         folder = self.out or unused(run.folder / "adaptations" / time.strftime("%Y%m%d-%H%M%S"))
         fingerprints = {track.name: track.fingerprint for track in tracks}
-        digest = hashlib.sha256(run.policy_path.read_bytes()).hexdigest()
-        parts = Parts(folder, {**self._asked(), "tracks": fingerprints, "policy": digest})
         races = standing_starts(run.config.env, tracks, 0, self.time_limit)
         collecting = run.config.env.model_copy(update={"augment_tracks": False})
         base = AdaptationSettings(
@@ -138,8 +163,13 @@ class Adapt:
         seeds = range(self.seed, self.seed + self.seeds)
         methods = [(BEFORE, NO_SEED), *((rule, seed) for seed in seeds for rule in self.clip)]
         policies = [(track, method, seed) for track in tracks for method, seed in methods]
+        asked = {
+            **self._settings(), "tracks": fingerprints, "run": run.config, "versions": provenance()["versions"],
+            "policy": hashlib.sha256(run.policy_path.read_bytes()).hexdigest(),
+        }  # fmt: skip
+        parts = Parts(folder, asked)
         with (
-            _kept(parts, folder, self.out is None),
+            self._kept(parts, folder),
             progress_bar("adapting", len(policies), "policies", self.quiet) as update,
         ):
             for number, (track, method, seed) in enumerate(policies):
@@ -168,25 +198,6 @@ class Adapt:
         data = {**summary, "folder": folder}
         result = CommandResult(data, lambda console: _print(console, data))
         return with_recordings(result, folder, tracks[0]) if self.record else result
-
-
-@contextmanager
-def _kept(parts: Parts, folder: Path, unnamed: bool) -> Iterator[None]:
-    """If the block does not come to its end, says what is kept and how to go on; empties a folder without any part."""
-    try:
-        yield
-    except BaseException as error:
-        if parts.has(0):
-            place = f" and --out {shlex.quote(str(folder))}" if unnamed else ""
-            print(f"\nsaved; go on with the same command{place}", file=sys.stderr)
-        else:
-            parts.remove()
-            shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
-            with suppress(OSError):
-                folder.rmdir()
-            if isinstance(error, KeyboardInterrupt):
-                print(f"\n{NOTHING_KEPT}", file=sys.stderr)
-        raise
 
 
 def _print(console: Console, data: Mapping[str, Any]) -> None:

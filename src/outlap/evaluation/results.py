@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from filelock import FileLock, Timeout
 
 from outlap.errors import OutlapError
 from outlap.files import atomic_write, make_folder, remove_partials, to_json
@@ -58,19 +59,32 @@ class Parts:
             folder: of the evaluation.
             asked: all that the results depend on.
 
-        Raises OutlapError where something else is in the folder, or nothing can be written.
+        Raises OutlapError where something else is in the folder, another process is at work there, or nothing can be
+        written.
         """
         self.folder = folder / "parts"
-        path, content = self.folder / "asked.json", to_json(asked) + "\n"
-        if path.is_file():
-            if path.read_text() != content:
-                raise OutlapError(f"{folder}: was begun with other settings ({path}); give those, or another --out")
-            remove_partials(folder)
-        else:
+        self._asked = self.folder / "asked.json"
+        if not self._asked.is_file():
             with suppress(OSError):
-                self.folder.rmdir()  # of one that was killed in its first moment
+                shutil.rmtree(self.folder)  # of one that was killed in its first moment
             prepare_folder(folder)
-            atomic_write(path, content)
+        make_folder(self.folder)
+        self._lock = FileLock(self.folder / ".lock")
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise OutlapError(
+                f"{folder}: another process is at work there; wait for it, or give another --out"
+            ) from None
+        content = to_json(asked) + "\n"
+        if self._asked.is_file() and self._asked.read_text(encoding="utf-8") != content:
+            self._lock.release()
+            raise OutlapError(
+                f"{folder}: was begun with other settings, tracks, policy or versions ({self._asked}); give those, or "
+                "another --out"
+            )
+        remove_partials(folder)
+        atomic_write(self._asked, content)
 
     def has(self, number: int) -> bool:
         """Whether a part is done."""
@@ -94,8 +108,14 @@ class Parts:
         """Rows of updates of all parts, in their order."""
         return self._all(UPDATES)
 
+    def close(self) -> None:
+        """Let another process go on."""
+        self._lock.release()
+
     def remove(self) -> None:
-        """Remove all parts: the whole is written, or there is none."""
+        """Remove all parts, and close: the whole is written, or there is none."""
+        self._asked.unlink(missing_ok=True)  # first: what is left after that is nobody's
+        self.close()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, number: int, name: str) -> Path:

@@ -25,18 +25,26 @@ def gru(projected: Tensor, valid: Tensor, first: Tensor, length: int, weight: Te
     Cho et al. (2014), with the reset gate behind the recurrent product as in cuDNN and `torch.nn.GRU`.
 
     Args:
-        projected: (rows, n, 3 hidden) the inputs' share x of r, u and c.
+        projected: (rows, n, 3 hidden) the inputs' share x of r, u and c. In bfloat16 on a CPU, the products are made
+            of factors rounded to that and are rounded so, and the states stay float32.
         valid: (rows, n), 0 where the state is held at 0.
         first: int64 (n,) the row where each window begins.
         length: rows of a window.
         weight: (3 hidden, hidden) and
         bias: (3 hidden,) of the recurrent product.
+
+    Raises ValueError where shapes do not fit, or a window leaves the rows.
     """
-    if projected.device.type == "cpu" and projected.dtype in _STEPS:
-        given = projected.contiguous(), valid.float().contiguous(), first.contiguous(), length, weight, bias
-        states = GRULayer.apply(*given, torch.is_grad_enabled())
+    rows, n, width = projected.shape
+    fit = width == len(weight) == len(bias) == 3 * weight.shape[1] and valid.shape == (rows, n) and first.shape == (n,)
+    on_cpu = projected.device.type == "cpu"  # elsewhere PyTorch looks at the range itself
+    if not fit or (on_cpu and not ((first >= 0) & (first + length <= rows)).all()):
+        raise ValueError(f"windows of {length} rows do not fit {tuple(projected.shape)}, or weights or masks do not")
+    if on_cpu and projected.dtype in _STEPS:
+        given = projected.contiguous(), valid.float().contiguous(), first.long().contiguous(), length, weight
+        states = GRULayer.apply(*given, bias.float().contiguous(), torch.is_grad_enabled())
         assert isinstance(states, Tensor)
-        return states
+        return states.to(weight.dtype)
     return _gru_of_operations(projected, valid, first, length, weight, bias)
 
 
@@ -59,10 +67,7 @@ def _gru_of_operations(
 
 
 class GRULayer(torch.autograd.Function):
-    """`gru` on a CPU; `projected` and `valid` are contiguous.
-
-    With `projected` in bfloat16 the factors of all products are, and what is summed over steps stays float32.
-    """
+    """`gru` on a CPU, for `projected` in float32 or bfloat16."""
 
     @staticmethod
     def forward(
@@ -109,13 +114,13 @@ class GRULayer(torch.autograd.Function):
         length, n, hidden = arrived.shape
         grad = torch.empty_like(projected)
         spare = len(projected) - length  # rows at either end that are not in every window
-        for outside in (grad[:spare], grad[len(grad) - spare :]):
+        for outside in (grad[:spare], grad[length:]):
             outside.zero_()
         recurrent = grad.new_empty(length, n, 3 * hidden)  # the gradient of the recurrent products
         back = torch.zeros_like(arrived[0])
         rounds = projected.dtype != back.dtype
         product = grad.new_zeros(n, hidden) if rounds else back
-        own = torch.empty_like(gates[0])
+        own = torch.empty_like(gates[0]) if rounds else grad
         step_back = RowLoop(
             _STEPS_BACK[projected.dtype], n, hidden, valid, first, gates, candidates, states, arrived, back,
             product, grad, recurrent, own,
@@ -241,7 +246,7 @@ def _step_bfloat16(given):
 
 @cfunc(ROW_LOOP, **_OPTIONS)
 def _step_back_float32(given):
-    _step_back(given, None, None, floats(given[12]), floats(given[13]))
+    _step_back(given, None, None, floats(given[14]), floats(given[13]))
 
 
 @cfunc(ROW_LOOP, **_OPTIONS)

@@ -14,21 +14,25 @@ from typing import Any
 import numpy as np
 import torch
 from llvmlite import ir
-from numba import types
+from numba import njit, types
 from numba.core.ccallback import CFunc
 from numba.extending import intrinsic
 from torch import Tensor
 
+from outlap.kernel_cache import discard_stale_kernels
+
 BLOCK = 32  # rows that a thread takes at a time
 ROWS_OF_THREAD = 128  # with fewer a second thread is not worth its start
+DTYPES = (torch.float32, torch.bfloat16, torch.int64)  # for `floats`, `bfloats` and `integers`
 ROW_LOOP = types.void(types.CPointer(types.uint64))  # the signature of a kernel, for `numba.cfunc`
 
 
 class RowLoop:
     """A kernel and what it works on.
 
-    A kernel is given one array: blocks taken, rows, step, and then what the constructor was given. It takes blocks of
-    rows by `take` until none is left. Since rows are independent, any number of threads gives the same.
+    A kernel is given one array: the first row that is not taken yet, rows, step, and then what the constructor was
+    given. It takes blocks of rows by `take` until none is left. Since rows are independent, any number of threads
+    gives the same.
     """
 
     def __init__(self, kernel: CFunc, rows: int, *given: int | Tensor) -> None:
@@ -39,11 +43,12 @@ class RowLoop:
             rows: to go through.
             given: whole numbers, and contiguous tensors of the CPU, by their addresses.
 
-        Raises ValueError for other tensors.
+        Raises ValueError for other tensors, and for types of number that a kernel cannot read.
         """
-        if any(isinstance(g, Tensor) and not (g.is_contiguous() and g.device.type == "cpu") for g in given):
-            raise ValueError("a row loop takes contiguous tensors of the CPU")
-        self._tensors = given  # kept from being freed
+        for tensor in (g for g in given if isinstance(g, Tensor)):
+            if not tensor.is_contiguous() or tensor.device.type != "cpu" or tensor.dtype not in DTYPES:
+                raise ValueError(f"a row loop takes contiguous tensors of the CPU, of {', '.join(map(str, DTYPES))}")
+        self._kept = given  # tensors, from being freed
         self._given = np.array([0, rows, 0, *(g.data_ptr() if isinstance(g, Tensor) else g for g in given)], np.uint64)
         self._address = self._given.ctypes.data
         self._kernel = kernel
@@ -61,13 +66,14 @@ class RowLoop:
 
 @cache
 def _parallel() -> Callable[..., None] | None:
-    """`GOMP_parallel` of the OpenMP library that PyTorch brings with it; None where it brings another or none."""
-    for path in (Path(torch.__file__).parent / "lib").glob("libgomp*.so*"):
-        function = ctypes.CDLL(str(path)).GOMP_parallel
-        function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint]
-        function.restype = None
-        return function
-    return None
+    """`GOMP_parallel` of the very OpenMP library that PyTorch is linked to; None where that is another or none."""
+    try:
+        function = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / "libtorch_cpu.so")).GOMP_parallel
+    except (OSError, AttributeError):
+        return None
+    function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint]
+    function.restype = None
+    return function
 
 
 def _take(typingctx, given):
@@ -101,7 +107,8 @@ def _store(typingctx, numbers, index, value):
     def code(context, builder, signature, arguments):
         place, value = builder.gep(arguments[0], [arguments[1]]), arguments[2]
         if numbers.dtype == types.float32:
-            return builder.store(value, place)
+            builder.store(value, place)
+            return None
         bits = builder.bitcast(value, _WORD)  # to the nearest, and of two to the even one
         odd = builder.and_(builder.lshr(bits, _WORD(16)), _WORD(1))
         rounded = builder.add(builder.add(bits, _WORD(0x7FFF)), odd)
@@ -120,3 +127,11 @@ floats: Any = intrinsic(_pointer(types.float32))
 bfloats: Any = intrinsic(_pointer(types.uint16))  # bfloat16, for `load` and `store`
 load: Any = intrinsic(_load)  # (floats or bfloats, index): float32
 store: Any = intrinsic(_store)  # (floats or bfloats, index, float32)
+
+
+@njit(cache=True)
+def _probe():
+    return 0
+
+
+discard_stale_kernels(_probe, [Path(__file__)])  # that are compiled from the above, too

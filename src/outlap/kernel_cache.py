@@ -8,32 +8,25 @@ layout, and crash.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-
-from numba import njit
+from typing import Any
 
 from outlap.files import atomic_write
 
-PACKAGE = Path(__file__).resolve().parents[1]
 
+def discard_stale_kernels(probe: Any, sources: Iterable[Path]) -> None:
+    """Delete a folder's compiled functions unless they are of today's sources. Call before the first is used.
 
-@njit(cache=True)
-def _probe():  # its cache is where the cache of this folder's functions is
-    return 0
-
-
-def discard_stale_kernels() -> None:
-    """Delete this folder's compiled functions unless they are of today's sources. Call before the first is used."""
-    path = _probe.stats.cache_path
+    Args:
+        probe: any function of the folder, decorated with `njit(cache=True)`: it knows where the folder's cache is.
+        sources: all files that its functions are compiled from.
+    """
+    path = probe.stats.cache_path
     if path is None:  # caching is switched off
         return
     folder = Path(path)
-    sources = [
-        *sorted((PACKAGE / "simulator").glob("*.py")),
-        PACKAGE / "seeding.py",
-        PACKAGE / "track" / "centerline.py",
-    ]
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
     stamp = folder / "sources.sha256"
     with suppress(OSError):
