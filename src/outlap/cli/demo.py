@@ -15,8 +15,8 @@ from outlap.cli.output import CommandResult
 class Demo:
     """Meta-train a policy on the built-in training circuits; race it on three that it never saw, adapt, race again.
 
-    The same as `outlap train mql` and `outlap adapt --clip abc` with their defaults, but shorter, and so is the time
-    over which the penalty for crashing grows.
+    The same as `outlap train mql` and `outlap adapt --clip abc` with their defaults, but shorter, and the penalty for
+    crashing grows sooner.
     """
 
     steps: int = 350_000
@@ -45,8 +45,9 @@ class Demo:
         from outlap.training.mql import MQLConfig
 
         usual = MQLConfig()
-        # The penalty for crashing grows over the same share of a shorter training.
-        growth = usual.env.reward.collision_steps * self.steps / usual.total_steps
+        # Over four times the usual share of the training: so short a one has not learnt to drive when the penalty is
+        # high, and then creeps.
+        growth = 4.0 * usual.env.reward.collision_steps * self.steps / usual.total_steps
         reward = usual.env.reward.model_copy(update={"collision_steps": growth})
         env = usual.env.model_copy(update={"reward": reward})
         settings = {
