@@ -5,6 +5,7 @@ Those of Numba change nothing at all: see tests/simulator/test_batch.py.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -100,6 +101,7 @@ def test_a_training_resumed_from_a_checkpoint_is_the_one_that_was_never_stopped(
         train(config, stopped, on_progress=kill)
     steps = [int(path.stem.removeprefix("step_")) for path in load_run(stopped).checkpoints()]
     assert steps == [config.total_steps // 2, config.total_steps // 4]
+    time.sleep(1.1)  # TensorBoard orders the files of a log by the second of their names first
     for rng in (torch.manual_seed, np.random.seed):  # whatever the next process begins with
         rng(99)
     same = train(config, stopped, resume=load_run(stopped))
@@ -111,6 +113,7 @@ def test_a_training_resumed_from_a_checkpoint_is_the_one_that_was_never_stopped(
     curve, curve_again = (read_learning(each.folder) for each in (run, same))
     assert len(curve) > 2
     pd.testing.assert_frame_equal(curve, curve_again)
+    assert len(list(stopped.glob("tensorboard/*"))) == 2  # one a session: of two in one second, either may come first
     if config.algorithm == "mql":
         with np.load(run.replay_path) as one, np.load(same.replay_path) as other:
             assert one.files == other.files

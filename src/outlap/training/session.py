@@ -24,6 +24,7 @@ from outlap.training.run import Run, create_run, save_checkpoint
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.logger import Logger
 
     from outlap.envs.sb3_vec_env import SB3VecEnv
 
@@ -124,7 +125,6 @@ def train(
     if resume is not None and resume.finished:
         return resume
     import torch
-    from stable_baselines3.common.logger import configure
 
     from outlap.envs.sb3_vec_env import SB3VecEnv
 
@@ -145,9 +145,7 @@ def train(
     begun_at = model.num_timesteps
     environment.env.training_steps = begun_at
     _seed_stint(model, config)
-    if resume:
-        _forget_curve_after(begun_at, run.folder / "tensorboard")
-    model.set_logger(configure(str(run.folder / "tensorboard"), ["tensorboard"]))
+    model.set_logger(_make_logger(run.folder / "tensorboard", begun_at))
     clock = Stopwatch(float(run.record().get("seconds", 0.0)) if begun_at else 0.0)
     watcher = _watcher(run, config, clock, on_progress)
     try:
@@ -177,11 +175,16 @@ def train(
     return run
 
 
-def _forget_curve_after(steps: int, folder: Path) -> None:
-    """Have readers of a log pass over what was noted beyond a checkpoint that a run goes on from: it comes again."""
-    from torch.utils.tensorboard import SummaryWriter
+def _make_logger(folder: Path, begun_at: int) -> Logger:
+    """A log that has its readers pass over what was noted beyond the steps that a run goes on from: it comes again."""
+    from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+    from tensorboard.compat.proto.event_pb2 import Event, SessionLog  # type: ignore[attr-defined]
 
-    SummaryWriter(str(folder), purge_step=steps + 1).close()
+    output = TensorBoardOutputFormat(str(folder))
+    assert output.writer.file_writer is not None
+    # In the log's own file: of two that were begun in one second, readers may take either first.
+    output.writer.file_writer.add_event(Event(step=begun_at + 1, session_log=SessionLog(status=SessionLog.START)))
+    return Logger(str(folder), [output])
 
 
 def _save(run: Run, model: Any, clock: Stopwatch) -> None:
