@@ -152,7 +152,9 @@ def report_share(task: int, share: float) -> None:
 
 def import_learning() -> None:
     """Import what takes longest, before a task begins: a worker can be ended meanwhile."""
+    import sklearn.linear_model  # noqa: F401
     import stable_baselines3  # noqa: F401 - and PyTorch with it
+    import torch._dynamo  # noqa: F401 - else the first optimizer does so
 
 
 def is_importing(frame: FrameType | None) -> bool:
