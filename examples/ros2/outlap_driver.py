@@ -13,6 +13,8 @@ begin with a low `speed_limit`.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -28,8 +30,11 @@ from outlap.deploy import CarDriver, Command
 class Loop:
     """The newest messages, and what to do about them. Knows nothing of ROS but the messages' fields."""
 
-    def __init__(self, driver: CarDriver) -> None:
-        self.driver = driver
+    def __init__(self, driver: CarDriver, speed_limit: float) -> None:
+        """Drive no faster than `speed_limit` [m/s]; raises ValueError where that is negative or NaN."""
+        if not speed_limit >= 0.0:
+            raise ValueError(f"speed_limit is {speed_limit}; must be 0 m/s or more")
+        self.driver, self.speed_limit = driver, speed_limit
         self.scan: Any = None
         self.odometry: Any = None
 
@@ -38,7 +43,7 @@ class Loop:
         if self.scan is None or self.odometry is None:
             return Command(0.0, 0.0, f"no {'scan' if self.scan is None else 'odometry'} yet")
         twist = self.odometry.twist.twist
-        return self.driver.drive(
+        command = self.driver.drive(
             self.scan.ranges,
             self.scan.angle_min,
             self.scan.angle_increment,
@@ -46,14 +51,16 @@ class Loop:
             scan_age=now - _seconds(self.scan.header.stamp),
             odometry_age=now - _seconds(self.odometry.header.stamp),
         )
+        if not (math.isfinite(command.steering_angle) and math.isfinite(command.speed)):  # min and max let NaN through
+            return Command(0.0, 0.0, f"the command is {command.steering_angle} rad, {command.speed} m/s")
+        return replace(command, speed=max(-self.speed_limit, min(self.speed_limit, command.speed)))
 
 
 class OutlapDriver(Node):
     def __init__(self) -> None:
         super().__init__("outlap_driver")
         path = self.declare_parameter("policy", "policy.onnx").value
-        self._speed_limit = float(self.declare_parameter("speed_limit", 3.0).value)  # [m/s]
-        self._loop = Loop(CarDriver(path))
+        self._loop = Loop(CarDriver(path), float(self.declare_parameter("speed_limit", 3.0).value))
         self._reason = ""
         self.create_subscription(LaserScan, "/scan", self._on_scan, qos_profile_sensor_data)
         self.create_subscription(Odometry, "/odom", self._on_odometry, 10)
@@ -75,7 +82,7 @@ class OutlapDriver(Node):
         message = AckermannDriveStamped()
         message.header.stamp = now.to_msg()
         message.drive.steering_angle = command.steering_angle
-        message.drive.speed = max(-self._speed_limit, min(self._speed_limit, command.speed))
+        message.drive.speed = command.speed
         self._drive.publish(message)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,9 +56,12 @@ class Export:
             of_action, of_command = compare(
                 run, CarDriver(path), self.steps, on_step=lambda done: update(done, "") if done % 50 == 0 else None
             )
-        if of_action > LARGEST_DIFFERENCE:
+        if not of_action <= LARGEST_DIFFERENCE or math.isnan(of_command):  # NaN is not either
             path.unlink()
-            raise OutlapError(f"{run.folder}: the file differs from the policy by {of_action:.2g}; please report this")
+            raise OutlapError(
+                f"{run.folder}: the file differs from the policy by {of_action:.2g} in its actions and "
+                f"{of_command:.2g} in its commands; please report this"
+            )
         data = {
             "file": path, "bytes": path.stat().st_size, "steps_compared": self.steps,
             "largest_action_difference": of_action, "largest_command_difference": of_command, **facts,
