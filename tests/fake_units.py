@@ -22,6 +22,7 @@ class Fake(Unit):
     dies: bool = False  # takes its process with it
     ticks: int = 1  # of 50 ms
     until: str | None = None  # a file is there
+    silent: bool = False  # reports nothing meanwhile
     on_gpu: bool = False
     on_track: str | None = None
 
@@ -54,7 +55,8 @@ class Fake(Unit):
             report((tick + 1) / self.ticks)
         while self.until and not Path(self.until).exists():
             time.sleep(0.05)
-            report(0.99)
+            if not self.silent:
+                report(0.99)
         (folder / "ended").write_text(str(time.monotonic()))
 
 

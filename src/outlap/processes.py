@@ -82,31 +82,53 @@ class Workers:
                 process.kill()
 
 
+class Interruptible:
+    """Work of the main thread that another thread can interrupt, wherever it is."""
+
+    def __init__(self) -> None:
+        self._at_work = self._is_to_end = False
+        self._changing = threading.Lock()
+        # What Python sets by itself, unless the process was started with SIGINT ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    @contextmanager
+    def at_work(self) -> Iterator[None]:
+        """The work. KeyboardInterrupt comes at once where `interrupt` was called before."""
+        with self._changing:
+            if self._is_to_end:
+                raise KeyboardInterrupt
+            self._at_work = True
+        try:
+            yield
+        finally:
+            with self._changing:
+                self._at_work = False
+
+    def interrupt(self) -> bool:
+        """Interrupt it, once it is not importing any more; whether it was at work."""
+        main = threading.main_thread().ident
+        while is_importing(sys._current_frames().get(main or 0)):
+            time.sleep(LOOK)
+        with self._changing:
+            self._is_to_end = True
+            if self._at_work:
+                _thread.interrupt_main()  # and no real signal: those may be kept away from this process
+            return self._at_work
+
+
 class _Worker:
     """This process, if it is one of a pool."""
 
-    share: Any
-    begun: Any
-    stop: Any
-
-    def __init__(self) -> None:
-        self.at_work = False
-        self.changing = threading.Lock()
-
-    def is_to_end(self) -> bool:
-        """Whether nobody wants its work any more for now."""
-        return bool(self.stop.value) or is_orphan()
+    def __init__(self, share: Any, begun: Any, stop: Any) -> None:
+        self.share, self.begun, self._stop = share, begun, stop
+        self.work = Interruptible()
 
     def watch(self) -> None:
-        """Interrupt the main thread once it is to end, wherever it is."""
-        main = threading.main_thread().ident
-        while not self.is_to_end() or is_importing(sys._current_frames().get(main or 0)):
+        """Interrupt the work once nobody wants it any more for now."""
+        while not (self._stop.value or is_orphan()):
             time.sleep(LOOK)
-        with self.changing:
-            if self.at_work:
-                _thread.interrupt_main()  # and no real signal: those are kept away from this process
-            elif is_orphan():
-                os._exit(1)
+        if not self.work.interrupt() and is_orphan():
+            os._exit(1)
 
 
 _worker: _Worker | None = None
@@ -115,9 +137,7 @@ _worker: _Worker | None = None
 def start_worker(share: Any, begun: Any, stop: Any) -> None:
     """The initializer of a pool's processes: light, so that they can be ended while they import what they work with."""
     global _worker
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    _worker = _Worker()
-    _worker.share, _worker.begun, _worker.stop = share, begun, stop
+    _worker = _Worker(share, begun, stop)
     threading.Thread(target=_worker.watch, daemon=True).start()
 
 
@@ -129,19 +149,13 @@ def at_work(task: int) -> Iterator[None]:
         yield
         return
     worker.begun[task] = 1
-    with worker.changing:
-        worker.at_work = True
     try:
-        if worker.is_to_end():
-            raise KeyboardInterrupt
-        yield
+        with worker.work.at_work():
+            yield
     except KeyboardInterrupt:
         if is_orphan():
             os._exit(1)
         raise
-    finally:
-        with worker.changing:
-            worker.at_work = False
 
 
 def report_share(task: int, share: float) -> None:

@@ -7,12 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from filelock import FileLock
 
 pytest.importorskip("ray", reason="needs Ray: pip install 'outlap[distributed]'")
 
@@ -21,9 +23,11 @@ from ray.cluster_utils import Cluster
 
 from fake_units import Fake, begun, ended
 from outlap.errors import OutlapError
+from outlap.experiments.engine import LocalEngine
 from outlap.experiments.ray_engine import RayEngine
 from outlap.experiments.runner import Status, run_units
-from outlap.experiments.sweep import SweepConfig
+from outlap.experiments.store import Store
+from outlap.experiments.sweep import Range, SweepConfig
 from outlap.experiments.tune import tune_trials
 from outlap.training.run import load_run
 
@@ -106,6 +110,42 @@ def test_a_lost_node_loses_no_unit_that_is_done_and_its_units_go_on_elsewhere(
         assert 5 <= times_begun() <= 6
 
 
+def test_what_was_done_without_the_store_is_put_there(cluster: Cluster, tmp_path: Path):
+    work, store = tmp_path / "work", f"file://{tmp_path / 'store'}"
+    first, other = Fake("first"), Fake("other", ticks=100)
+    second = Fake("second", before=(first,))
+    last = Fake("last", before=(second,))
+    run_units([first, second], work, LocalEngine(1))
+    other.folder(work).mkdir(parents=True)
+    (other.folder(work) / "ticks").write_text("99")  # as far as another engine came
+    run_units([first, second, last, other], work, RayEngine(store=store))
+    assert all(unit.is_done(work) for unit in (last, other))
+    assert [len(begun(unit, work)) for unit in (first, second, last)] == [1, 1, 1]
+    assert ended(other, work) - begun(other, work)[0] < 0.05 * 50
+    assert Store(store).done() == {unit.key for unit in (first, second, last, other)}
+
+
+def test_a_unit_that_cannot_be_fetched_stops_only_those_that_need_it(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    work, store = tmp_path / "work", f"file://{tmp_path / 'store'}"
+    first, other = Fake("first"), Fake("other", ticks=20)
+
+    def get(self: Store, unit: Fake, work: Path) -> None:
+        if unit.name == "first":
+            raise OSError("no network")
+        fetch(self, unit, work)
+
+    with monkeypatch.context() as patch:
+        fetch = Store.get
+        patch.setattr(Store, "get", get)
+        with pytest.raises(OutlapError, match=r"1 of 2 units of work failed, first first \(OSError: no network\)"):
+            run_units([first, other], work, RayEngine(store=store))
+    assert other.is_done(work)
+    run_units([first, other], work, RayEngine(store=store))
+    assert len(begun(first, work)) == 1
+
+
 def test_a_unit_uses_its_share_of_a_gpu(cluster: Cluster, tmp_path: Path):
     work, together = tmp_path / "halves", tmp_path / "together"
     halves = [Fake(f"half {number}", until=str(together), on_gpu=True) for number in range(2)]
@@ -128,7 +168,7 @@ from pathlib import Path
 from fake_units import Fake
 from outlap.experiments.ray_engine import RayEngine
 from outlap.experiments.runner import run_units
-units = [Fake("short"), Fake("long", ticks=80)]
+units = [{units}]
 run_units(units, Path("work"), RayEngine(sys.argv[1], store=sys.argv[2] if len(sys.argv) > 2 else None))
 """
 
@@ -138,15 +178,8 @@ def test_after_ctrl_c_or_a_kill_of_the_driver_the_same_units_go_on(
     cluster: Cluster, by: signal.Signals, with_store: bool, tmp_path: Path
 ):
     store = f"file://{tmp_path / 'store'}" if with_store else None
-    (tmp_path / "script.py").write_text(SCRIPT)
     work, short, long = tmp_path / "work", Fake("short"), Fake("long", ticks=80)
-    process = subprocess.Popen(
-        [sys.executable, "script.py", str(cluster.address), *([store] if store else [])],
-        cwd=tmp_path,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": TESTS},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    process = started(cluster, tmp_path, 'Fake("short"), Fake("long", ticks=80)', *([store] if store else []))
     wait_for(lambda: short.is_done(work))
     time.sleep(1.0)
     process.send_signal(by)
@@ -156,6 +189,42 @@ def test_after_ctrl_c_or_a_kill_of_the_driver_the_same_units_go_on(
     assert long.is_done(work)
     assert len(begun(short, work)) == 1
     assert len(begun(long, work)) == 2
+
+
+def test_ctrl_c_does_not_wait_for_the_next_report(cluster: Cluster, tmp_path: Path):
+    unit = Fake("deaf", until="never", silent=True)
+    process = started(cluster, tmp_path, 'Fake("deaf", until="never", silent=True)')
+    wait_for(lambda: begun(unit, tmp_path / "work"))
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    process.wait(timeout=20.0)  # it takes 2 s, and a minute where the unit does not hear of it
+    with FileLock(unit.folder(tmp_path / "work") / ".lock", timeout=5.0):  # which the unit held
+        assert not unit.is_done(tmp_path / "work")
+
+
+def test_ctrl_c_ends_units_that_cannot_be_told(cluster: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    engine, unit = RayEngine(), Fake("deaf", until="never", silent=True)
+    (tmp_path / ".lock").touch()
+    engine.open([unit], tmp_path)
+    engine.submit(unit)
+    wait_for(lambda: begun(unit, tmp_path))
+    ray.kill(engine._board)
+    engine.close()
+    assert "cannot be told to stop" in caplog.text
+    with FileLock(unit.folder(tmp_path) / ".lock", timeout=20.0):  # which the unit held
+        assert not unit.is_done(tmp_path)
+
+
+def started(cluster: Cluster, folder: Path, units: str, *store: str) -> subprocess.Popen[bytes]:
+    """A process that does some units in a folder."""
+    (folder / "script.py").write_text(SCRIPT.format(units=units))
+    return subprocess.Popen(
+        [sys.executable, "script.py", str(cluster.address), *store],
+        cwd=folder,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": TESTS},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 def wait_for(there) -> None:
@@ -182,12 +251,14 @@ def test_a_machine_that_does_not_have_the_tracks_says_so(cluster: Cluster, tmp_p
     assert not begun(unit, tmp_path)
 
 
+SHORT = {
+    "total_steps": 4096, "num_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 1, "net_arch": [8],
+    "env": {"tracks": ["Nightjar"], "beams": 8, "termination": {"time_limit": 1.0}},
+}  # fmt: skip
+
+
 def test_tune_stops_what_falls_behind_and_keeps_the_best(cluster: Cluster, tmp_path: Path):
-    training = {
-        "total_steps": 4096, "num_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 1, "net_arch": [8],
-        "checkpoint_every": 512, "env": {"tracks": ["Nightjar"], "beams": 8, "termination": {"time_limit": 1.0}},
-    }  # fmt: skip
-    sweep = SweepConfig(algorithm="ppo", training=training, search={"learning_rate": (1e-3, 1e-5)})
+    sweep = SweepConfig(algorithm="ppo", training=SHORT, search={"learning_rate": (1e-3, 1e-5)})
     counts: list[int] = []
     found = tune_trials(sweep, tmp_path, on_trials=lambda done, running: counts.append(done))
     assert sorted(found["learning_rate"]) == [1e-5, 1e-3]
@@ -196,6 +267,45 @@ def test_tune_stops_what_falls_behind_and_keeps_the_best(cluster: Cluster, tmp_p
     assert counts[-1] == 2
     best = load_run(tmp_path / "best")
     assert best.config.learning_rate == found["learning_rate"].iloc[0]
-    assert best.policy_path.is_file()
+    assert best.finished  # though no checkpoint is due before its end
+    assert best.policy_path == best.folder / "policy.zip"
     again = tune_trials(sweep, tmp_path)  # nothing is left to do
     pd.testing.assert_frame_equal(again, found)
+
+
+def test_tune_ranks_meta_trainings_that_are_done_first(cluster: Cluster, tmp_path: Path):
+    # Reports come every 32 actions of a world, which the end is not one of.
+    training = {
+        "total_steps": 600, "num_envs": 4, "learning_starts": 32, "batch_size": 16, "buffer_size": 4000,
+        "env": {"tracks": ["Nightjar"], "augment_tracks": False, "beams": 8, "termination": {"time_limit": 1.0}},
+    }  # fmt: skip
+    found = tune_trials(SweepConfig(algorithm="mql", training=training, search={"gamma": (0.99,)}), tmp_path)
+    assert found["steps"].tolist() == [600]
+    assert found["stopped_early"].tolist() == [False]
+    assert load_run(tmp_path / "best").finished
+
+
+def test_tune_that_is_interrupted_goes_on_with_the_trials_that_follow_from_the_seed(cluster: Cluster, tmp_path: Path):
+    sweep = SweepConfig(
+        algorithm="ppo",
+        training=SHORT,
+        search={"gamma": Range(distribution="uniform", low=0.9, high=1.0)},
+        trials=2,
+        seed=3,
+    )
+    lock = threading.RLock()  # as a progress bar has one
+
+    def stop(done: int, running: int) -> None:
+        with lock:
+            if running:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune_trials(sweep, tmp_path, on_trials=stop)
+    counts: list[int] = []
+    found = tune_trials(sweep, tmp_path, on_trials=lambda done, running: counts.append(done))
+    assert counts[-1] == 2
+    drawn = sweep.draw()
+    assert [drawn[number]["gamma"] for number in found["trial"]] == found["gamma"].tolist()
+    assert sorted(found["trial"]) == [0, 1]
+    assert load_run(tmp_path / "best").config.gamma == found["gamma"].iloc[0]

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,38 @@ def test_a_process_that_dies_takes_no_other_unit_with_it(tmp_path: Path):
     assert "BrokenProcessPool" in str(error.value)
     assert all(unit.is_done(tmp_path) for unit in others)
     assert len(begun(deadly, tmp_path)) == 2  # beside another one, and alone
+
+
+@pytest.mark.parametrize("busy", [True, False])
+def test_a_process_that_dies_before_the_next_unit_is_submitted(busy: bool, tmp_path: Path):
+    engine, released = LocalEngine(2), tmp_path / "released"
+    first, second = Fake("first", until=str(released)), Fake("second")
+    engine.open([first, second], tmp_path)
+    try:
+        engine.submit(first)
+        wait_for(lambda: begun(first, tmp_path))
+        outcomes = []
+        if not busy:
+            released.touch()
+            wait_for(lambda: outcomes.extend(engine.wait(0.1)) or outcomes)
+        os.kill(next(iter(engine._pool._processes)), signal.SIGKILL)
+        wait_for(lambda: engine._pool._broken)
+        engine.submit(second)
+        released.touch()
+        wait_for(lambda: outcomes.extend(engine.wait(0.1)) or len(outcomes) == 2)
+    finally:
+        engine.close()
+    assert [outcome.error for outcome in outcomes] == [None, None]
+    assert len(begun(first, tmp_path)) == 1 + busy
+    assert len(begun(second, tmp_path)) == 1
+    assert engine._lost == ({first.key} if busy else set())  # the second may still be lost once
+
+
+def wait_for(there: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 60.0
+    while not there():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 SCRIPT = """

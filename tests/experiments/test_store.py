@@ -12,7 +12,10 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from fake_units import Fake
 from outlap.errors import OutlapError
+from outlap.experiments import ray_engine
+from outlap.experiments.ray_engine import Surroundings, _do_with_store, _Orders, _Progress
 from outlap.experiments.store import Store
+from outlap.experiments.unit import Report, Unit
 
 
 def kept(unit: Fake, work: Path, ticks: str) -> Path:
@@ -74,3 +77,71 @@ def test_what_another_machine_has_put_there_since_is_found(remembering: None, tm
         elsewhere.put(unit, tmp_path / "elsewhere")
         here.get(unit, tmp_path / "here")
         assert unit.key in here.done()
+
+
+class Failing(Store):
+    """Has an error at every copy of one kind."""
+
+    fails: str
+
+    def _put(self, unit: Unit, work: Path, suffix: str) -> None:
+        if suffix == self.fails:
+            raise OSError("no network")
+        super()._put(unit, work, suffix)
+
+
+def done_with(store: Failing, unit: Unit, folder: Path) -> None:
+    """The unit, done on a machine of a cluster that copies it after every report."""
+    folder.mkdir()
+    orders = _Orders(folder, store.url, {}, Surroundings.here())
+    _do_with_store(unit, orders, folder, store, _Progress(unit, board=None))
+
+
+def test_an_error_of_a_copy_costs_no_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(ray_engine, "STORE_EVERY", 0.0)
+    store, unit = Failing(f"file://{tmp_path / 'store'}"), Fake("long", ticks=3)
+    store.fails = ".tar"  # the last one, which is not passed over
+    with pytest.raises(OSError, match="no network"):
+        done_with(store, unit, tmp_path / "first")
+    assert (store.done(), store.begun()) == (set(), {unit.key})
+    store.fails = ".part.tar"
+    done_with(store, unit, tmp_path / "second")
+    assert store.done() == {unit.key}
+    other = Fake("other", ticks=2)
+    done_with(store, other, tmp_path / "third")
+    assert store.done() == {unit.key, other.key}
+    assert caplog.text.count("goes on, and is not copied") == 2
+
+
+class Stopping(Fake):
+    """Is interrupted once it has begun."""
+
+    def do(self, work: Path, report: Report) -> None:
+        kept(self, work, "1")
+        raise KeyboardInterrupt
+
+
+def test_what_ctrl_c_could_not_save_is_an_error(tmp_path: Path) -> None:
+    store, unit = Failing(f"file://{tmp_path / 'store'}"), Stopping("long")
+    store.fails = ".tar"
+    with pytest.raises(KeyboardInterrupt):
+        done_with(store, unit, tmp_path / "first")
+    assert store.begun() == {unit.key}
+    store.fails = ".part.tar"
+    with pytest.raises(OSError, match="no network"):
+        done_with(store, unit, tmp_path / "second")
+
+
+def test_a_copy_that_is_cut_off_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, unit = Store(f"file://{tmp_path / 'store'}"), Fake("long")
+    kept(unit, tmp_path / "here", "1")
+
+    def cut_off(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(store.files, "mv", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        store.put(unit, tmp_path / "here")
+    assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []

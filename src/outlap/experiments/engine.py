@@ -100,9 +100,21 @@ class LocalEngine:
         shared = self._workers.initializer_arguments
         return ProcessPoolExecutor(self.slots, mp_context=self._context, initializer=start_worker, initargs=shared)
 
+    def _renew_pool(self) -> None:
+        self._pool.shutdown()
+        self._pool = self._new_pool()
+
     def submit(self, unit: Unit) -> None:
         number = self._numbers[unit.key]
-        self._running[self._workers.submit(self._pool, number, _do_in_worker, unit, self._work, number)] = unit
+        try:
+            future = self._workers.submit(self._pool, number, _do_in_worker, unit, self._work, number)
+        except BrokenProcessPool:  # a process has died since the last `wait`
+            if self._running:
+                self._again.append(unit)  # for `wait`, which hears of those that died with it
+                return
+            self._renew_pool()
+            future = self._workers.submit(self._pool, number, _do_in_worker, unit, self._work, number)
+        self._running[future] = unit
 
     def wait(self, timeout: float) -> list[Outcome]:
         if not self._running and self._again:
@@ -110,8 +122,7 @@ class LocalEngine:
         finished, _ = wait(self._running, timeout, FIRST_COMPLETED)
         if any(isinstance(future.exception(), BrokenProcessPool) for future in finished):
             finished, _ = wait(self._running)  # all of them have the same error
-            self._pool.shutdown()
-            self._pool = self._new_pool()
+            self._renew_pool()
         outcomes = []
         for future in finished:
             unit = self._running.pop(future)

@@ -9,8 +9,10 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
+import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +21,12 @@ from outlap.errors import OutlapError
 from outlap.experiments.engine import Outcome, do_unit
 from outlap.experiments.store import Store
 from outlap.experiments.unit import Unit
+from outlap.processes import Interruptible, import_learning
+
+log = logging.getLogger(__name__)
 
 RETRIES = 5  # of a unit whose process or machine is lost
-REPORT_EVERY = 1.0  # [s] between two reports of how far a unit is
+REPORT_EVERY = 1.0  # [s] between two reports of how far a unit is, each of which asks whether it is to stop
 STORE_EVERY = 120.0  # [s] between two copies of an unfinished unit in the store
 PATIENCE = 60.0  # [s] for units to save what they have, after Ctrl-C
 QUEUE = 10_000  # units that Ray may have at a time, most of them waiting: that is what clusters grow by
@@ -116,10 +121,7 @@ class RayEngine:
         self._work = work.absolute()
         if self._store is not None:
             self._store.check()
-            there = self._store.done()
-            for unit in units:
-                if unit.key in there:
-                    self._store.get(unit, self._work)
+            self._exchange(units, self._store)
         self._began_ray = join_cluster(self._address)
         here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
         board = self._ray.remote(_Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
@@ -127,6 +129,23 @@ class RayEngine:
         url = self._store.url if self._store else None
         self._orders = _Orders(self._work, url, self._tracks, Surroundings.here())
         self._task = self._ray.remote(num_cpus=1, max_retries=RETRIES)(_do_there)
+
+    def _exchange(self, units: Sequence[Unit], store: Store) -> None:
+        """Fetch units that are done; put there what was done without the store, of the others and what they need."""
+        done, begun = store.done(), store.begun()
+        needed: dict[str, Unit] = {}
+        for unit in units:
+            if unit.key in done:
+                store.get(unit, self._work)
+                continue
+            needed |= {each.key: each for each in _all_needs(unit)}
+            if unit.key not in begun and unit.folder(self._work).is_dir():
+                log.info("%s: was begun without %s, and is copied there", unit.name, store.url)
+                store.put_part(unit, self._work)
+        for each in needed.values():
+            if each.key not in done and each.is_done(self._work):
+                log.info("%s: was done without %s, and is copied there", each.name, store.url)
+                store.put(each, self._work)
 
     def submit(self, unit: Unit) -> None:
         task = self._task.options(name=unit.name, num_gpus=self._gpu_share if unit.uses_gpu else 0)
@@ -146,7 +165,10 @@ class RayEngine:
         except self._ray.exceptions.RayError as error:  # lost more often than it may be tried again
             return Outcome(unit, error=error)
         if self._store is not None:
-            self._store.get(unit, self._work)
+            try:
+                self._store.get(unit, self._work)
+            except Exception as error:  # whatever its file system raises: the unit is kept there
+                return Outcome(unit, error=error)
         return Outcome(unit, seconds)
 
     def shares(self) -> Mapping[str, float]:
@@ -157,16 +179,34 @@ class RayEngine:
 
     def close(self) -> None:
         if self._running:
-            self._ray.get(self._board.stop.remote())
-            begun = self.shares()
+            begun = self._stop()
             for reference, unit in self._running.items():
                 if unit.key not in begun:
-                    self._ray.cancel(reference)
+                    self._ray.cancel(reference, force=True)  # it may be importing, which is not to be interrupted
             working = [reference for reference, unit in self._running.items() if unit.key in begun]
             if working:
-                self._ray.wait(working, num_returns=len(working), timeout=PATIENCE)
+                ended, late = self._ray.wait(working, num_returns=len(working), timeout=PATIENCE)
+                self._warn_of_lost_work(ended, late)
         if self._began_ray:
             self._ray.shutdown()
+
+    def _stop(self) -> Mapping[str, float]:
+        """Have units stop; those that have begun, by their keys."""
+        try:
+            return self._ray.get(self._board.stop.remote(), timeout=PATIENCE)
+        except self._ray.exceptions.RayError as error:  # as where the cluster is gone
+            log.warning("units cannot be told to stop, and are ended: %s", error)
+            return {}
+
+    def _warn_of_lost_work(self, ended: Sequence[Any], late: Sequence[Any]) -> None:
+        for reference in late:
+            log.warning("%s has not been saved within %.0f s", self._running[reference].name, PATIENCE)
+        for reference in ended:
+            try:
+                self._ray.get(reference)
+            except self._ray.exceptions.RayError as error:
+                cause = getattr(error, "cause", None) or error
+                log.warning("%s could not be saved: %s", self._running[reference].name, cause)
 
 
 class _Board:
@@ -188,8 +228,10 @@ class _Board:
     def shares(self) -> dict[str, float]:
         return self._shares
 
-    def stop(self) -> None:
+    def stop(self) -> dict[str, float]:
+        """Have all units stop; how far those are that have begun."""
         self._stopped = True
+        return self._shares
 
 
 @dataclass(frozen=True)
@@ -202,56 +244,99 @@ class _Orders:
     surroundings: Surroundings
 
 
-def _do_there(unit: Unit, orders: _Orders, board: Any) -> float | None:
-    """Do a unit on whatever machine this is; None where it was stopped."""
-    import ray
-    from ray.exceptions import RayError
+class _Progress:
+    """Of a unit that is done here: the board hears of it, and says when to interrupt the work."""
 
-    def tell(share: float) -> bool:
+    def __init__(self, unit: Unit, board: Any) -> None:
+        self.share = 0.0
+        self.work = Interruptible()
+        self._key, self._board, self._over = unit.key, board, threading.Event()
+
+    @contextmanager
+    def on_board(self) -> Iterator[None]:
+        """All that Ctrl-C waits for, work or not. Raises KeyboardInterrupt where units are to stop already."""
+        if self._tell():
+            raise KeyboardInterrupt
+        threading.Thread(target=self._watch, daemon=True).start()
         try:
-            return ray.get(board.report.remote(unit.key, share), timeout=10.0)
+            yield
+        finally:
+            self._over.set()
+
+    def note(self, share: float) -> None:
+        """So much is done."""
+        self.share = share
+
+    def _watch(self) -> None:
+        while not self._over.wait(REPORT_EVERY):
+            if self._tell():
+                self.work.interrupt()
+                self._over.wait()  # until what it has done is saved
+        self._board.leave.remote(self._key)
+
+    def _tell(self) -> bool:
+        """How far it is; whether it is to stop."""
+        import ray
+        from ray.exceptions import RayError
+
+        try:
+            return ray.get(self._board.report.remote(self._key, self.share), timeout=10.0)
         except RayError:  # on its way to another machine: nobody says to stop
             return False
 
+
+def _do_there(unit: Unit, orders: _Orders, board: Any) -> float | None:
+    """Do a unit on whatever machine this is; None where it was stopped."""
+    orders.surroundings.settle_in()
+    if unit.learns:
+        import_learning()  # before it is on the board: nobody waits for what has not begun
+    progress = _Progress(unit, board)
     try:
-        if tell(0.0):
-            return None
-        orders.surroundings.settle_in()
-        _check_tracks({name: orders.tracks[name] for name in unit.tracks if name in orders.tracks})
-        if orders.store is None:
-            return _do_in_common_folder(unit, orders.work, tell)
-        with tempfile.TemporaryDirectory(prefix="outlap-") as scratch:
-            return _do_with_store(unit, Path(scratch), Store(orders.store), tell)
+        with progress.on_board():
+            if orders.store is None:
+                return _do_in_common_folder(unit, orders, progress)
+            with tempfile.TemporaryDirectory(prefix="outlap-") as scratch:
+                return _do_with_store(unit, orders, Path(scratch), Store(orders.store), progress)
     except KeyboardInterrupt:
         return None
-    finally:
-        board.leave.remote(unit.key)
 
 
-def _do_in_common_folder(unit: Unit, work: Path, tell: Any) -> float:
+def _do_in_common_folder(unit: Unit, orders: _Orders, progress: _Progress) -> float:
+    work, machine = orders.work, os.uname().nodename
     if not (work / ".lock").is_file():  # of the process that hands out the units
-        raise OutlapError(f"{work}: is not seen by machine {os.uname().nodename}; give an --out that is, or a --store")
-    return do_unit(unit, work, _every(REPORT_EVERY, lambda share: _stop_if(tell(share))))
+        raise OutlapError(f"{work}: is not seen by machine {machine}; give an --out that is, or a --store")
+    with progress.work.at_work():
+        _check_tracks(unit, orders.tracks)
+        return do_unit(unit, work, progress.note)
 
 
-def _do_with_store(unit: Unit, scratch: Path, store: Store, tell: Any) -> float:
-    for needed in {each.key: each for each in _all_needs(unit)}.values():
-        store.get(needed, scratch)
-    store.get_part(unit, scratch)
-    keep = _every(STORE_EVERY, lambda _: store.put_part(unit, scratch))
-    ask = _every(REPORT_EVERY, lambda share: _stop_if(tell(share)))
+def _do_with_store(unit: Unit, orders: _Orders, scratch: Path, store: Store, progress: _Progress) -> float:
+    keep = _now_and_then(STORE_EVERY, lambda: _keep_part(unit, scratch, store))
 
     def report(share: float) -> None:
-        keep(share)
-        ask(share)
+        progress.note(share)
+        keep()
 
     try:
-        seconds = do_unit(unit, scratch, report)
+        with progress.work.at_work():
+            _check_tracks(unit, orders.tracks)
+            for needed in {each.key: each for each in _all_needs(unit)}.values():
+                store.get(needed, scratch)
+            store.get_part(unit, scratch)
+            seconds = do_unit(unit, scratch, report)
     except KeyboardInterrupt:
-        store.put_part(unit, scratch)
+        if unit.folder(scratch).is_dir():  # else what the store has of it is not here yet
+            store.put_part(unit, scratch)
         raise
     store.put(unit, scratch)
     return seconds
+
+
+def _keep_part(unit: Unit, scratch: Path, store: Store) -> None:
+    try:
+        store.put_part(unit, scratch)
+    except Exception as error:  # whatever its file system raises; the next copy may succeed
+        log.warning("%s: goes on, and is not copied to %s: %s", unit.name, store.url, error)
 
 
 def _all_needs(unit: Unit) -> Iterable[Unit]:
@@ -260,30 +345,25 @@ def _all_needs(unit: Unit) -> Iterable[Unit]:
         yield needed
 
 
-def _stop_if(stopped: bool) -> None:
-    if stopped:
-        raise KeyboardInterrupt
-
-
-def _every(seconds: float, report: Any) -> Any:
-    """A report that is made so often at most."""
+def _now_and_then(seconds: float, act: Callable[[], None]) -> Callable[[], None]:
+    """What acts when it is called, but so often at most."""
     last = time.monotonic()
 
-    def sometimes(share: float) -> None:
+    def sometimes() -> None:
         nonlocal last
         if time.monotonic() - last >= seconds:
+            act()
             last = time.monotonic()
-            report(share)
 
     return sometimes
 
 
-def _check_tracks(fingerprints: Mapping[str, str]) -> None:
+def _check_tracks(unit: Unit, fingerprints: Mapping[str, str]) -> None:
     """Raises OutlapError for a track that is another one here than where the work was planned."""
     from outlap.track.track import Track
 
-    for name, fingerprint in fingerprints.items():
-        if Track.load(name).fingerprint != fingerprint:
+    for name in unit.tracks:
+        if name in fingerprints and Track.load(name).fingerprint != fingerprints[name]:
             raise OutlapError(
                 f"track {name}: is another one on machine {os.uname().nodename} than where the work began; "
                 "give all machines the same tracks"

@@ -5,10 +5,12 @@ A unit is one archive there, written under another name first, so that there is 
 
 from __future__ import annotations
 
+import re
 import shutil
 import tarfile
 import tempfile
 import uuid
+from contextlib import suppress
 from pathlib import Path
 
 from outlap.errors import OutlapError
@@ -46,8 +48,11 @@ class Store:
 
     def done(self) -> set[str]:
         """Keys of the units that are there."""
-        names = (Path(path).name for path in self.files.find(self.root))
-        return {name[-16:-4] for name in names if name.endswith(".tar") and not name.endswith(".part.tar")}
+        return self._keys(".tar")
+
+    def begun(self) -> set[str]:
+        """Keys of the units that a part is there of."""
+        return self._keys(".part.tar")
 
     def put(self, unit: Unit, work: Path) -> None:
         """Keep a unit that is done."""
@@ -70,6 +75,10 @@ class Store:
         if not self._get(unit, work, ".tar"):
             self._get(unit, work, ".part.tar")
 
+    def _keys(self, suffix: str) -> set[str]:
+        ending = re.compile(rf"-([0-9a-f]{{12}}){re.escape(suffix)}$")
+        return {found[1] for path in self.files.find(self.root) if (found := ending.search(path))}
+
     def _path(self, unit: Unit, suffix: str) -> str:
         return f"{self.root}/{unit.kind}/{unit.name}-{unit.key}{suffix}"
 
@@ -81,8 +90,13 @@ class Store:
                 archive.add(unit.folder(work), ".", filter=_not_hidden)
             local.flush()
             self.files.makedirs(path.rpartition("/")[0], exist_ok=True)
-            self.files.put_file(local.name, beside)
-        self.files.mv(beside, path)
+            try:
+                self.files.put_file(local.name, beside)
+                self.files.mv(beside, path)
+            except BaseException:  # Ctrl-C, too
+                with suppress(Exception):  # there may be nothing, or no way to it
+                    self.files.rm_file(beside)
+                raise
 
     def _get(self, unit: Unit, work: Path, suffix: str) -> bool:
         path, folder = self._path(unit, suffix), unit.folder(work)
