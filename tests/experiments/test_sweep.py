@@ -77,6 +77,18 @@ def test_trials_are_judged_by_the_progress_of_their_races(tmp_path: Path):
     assert found["progress_low_m"].tolist() == [40.0, 15.0]
 
 
+def test_a_changed_file_keeps_the_units_of_the_trials_that_it_still_has():
+    def keys(**search) -> set[str]:
+        races = [race for trial in plan_trials(sweep(search=search, seeds=2)) for race in trial.races]
+        return {unit.key for race in races for unit in (race, *race.needs)}
+
+    before = keys(gamma=[0.9, 0.99], n_epochs=[1, 2])
+    after = keys(gamma=[0.9, 0.99], n_epochs=[1, 2, 3])  # the numbers of all trials but the first two change
+    assert len(before) == 4 * 2 * 2
+    assert len(after) == 6 * 2 * 2
+    assert before < after
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -121,5 +133,10 @@ def test_a_sweep_trains_races_and_names_the_best(tmp_path: Path, capsys: pytest.
     assert f"outlap train ppo --config {out / 'best.yaml'}" in capsys.readouterr().out
     done = {path: path.stat().st_mtime_ns for path in (out / "work").rglob("done.json")}
     assert len(done) == 4
+    # Values that are drawn twice, or that another file has had before, are not trained again.
+    file.write_text(yaml.safe_dump({**content, "search": {"gamma": [0.99, 0.99, 0.9]}}))
     assert main(["sweep", str(file), "--out", str(out), "--quiet"]) == 0
     assert {path: path.stat().st_mtime_ns for path in (out / "work").rglob("done.json")} == done
+    again = pd.read_parquet(out / "trials.parquet").set_index("trial")
+    assert again["gamma"].to_dict() == {0: 0.99, 1: 0.99, 2: 0.9}
+    assert again["progress_m"].tolist()[0] == again["progress_m"].tolist()[1]

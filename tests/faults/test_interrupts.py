@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from commands import Commands, Ended, leftovers
@@ -68,6 +69,39 @@ def test_opponents_are_saved_in_their_own_processes(commands: Commands, tmp_path
     (run,) = (tmp_path / "mine/work/opponents").glob("*/runs/*")
     assert load_run(run).checkpoints()
     assert leftovers(tmp_path) == []
+
+
+SEARCH = """
+algorithm: ppo
+training:
+  total_steps: 16384
+  num_envs: 4
+  n_steps: 16
+  batch_size: 64
+  n_epochs: 1
+  net_arch: [8]
+  checkpoint_every: 1024
+  env: {tracks: [Foxglove], augment_tracks: false, beams: 8, termination: {time_limit: 1.0}}
+search: {gamma: [0.9, 0.99]}
+"""
+
+
+def test_a_search_goes_on_with_the_same_command(
+    commands: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray", reason="needs Ray: pip install 'outlap[distributed]'")
+    (tmp_path / "search.yaml").write_text(SEARCH)
+    words = ["tune", "search.yaml", "--out", "out", "--jobs", "1", "--quiet"]
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # or they wait for the tests beside these
+    ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out/tune/*/checkpoint_*"), within=0.5)
+    check_ended(ended, "tune", "saved; go on with the same command\n")
+    assert not (tmp_path / "out" / "trials.parquet").exists()
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 0
+    found = pd.read_parquet(tmp_path / "out" / "trials.parquet")
+    assert sorted(found["trial"]) == [0, 1]
+    (first,) = (tmp_path / "out/tune").glob("*trial=0*/checkpoint_*")
+    assert len(load_run(first).record()["resumed"]) == 1
 
 
 @pytest.fixture(scope="module")

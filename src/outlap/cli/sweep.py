@@ -52,8 +52,8 @@ class Sweep(WorkFlags):
         trials = plan_trials(load_config(SweepConfig, self.file))
         folder = self.out or Path("runs") / f"sweep-{self.file.stem}"
         races = [race for trial in trials for race in trial.races]
-        units = [unit for race in races for unit in (*race.needs, race)]
-        self.do_units(units, folder / "work", "sweeping", self.quiet)
+        units = {unit.key: unit for race in races for unit in (*race.needs, race)}  # draws may come twice
+        self.do_units(list(units.values()), folder / "work", "sweeping", self.quiet)
         found = judge(trials, folder / "work")
         best = trials[int(found["trial"].iloc[0])]
         return _result(found, best.config, folder, len(best.races))
@@ -96,7 +96,7 @@ class Tune(ClusterFlags):
             except KeyboardInterrupt:
                 print("\nsaved; go on with the same command", file=sys.stderr)
                 raise
-        best = sweep.trial_config({name: found[name].iloc[0] for name in sweep.search})
+        best = sweep.trial_config(sweep.draw()[int(found["trial"].iloc[0])])
         return _result(found, best, folder)
 
 

@@ -10,6 +10,7 @@ trials: 12
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -28,6 +29,7 @@ from outlap.evaluation.results import ROWS
 from outlap.experiments.definitions import merge
 from outlap.experiments.plan import PAPER_REWARD, training_class
 from outlap.experiments.units import RaceUnit, Task, TrainingUnit
+from outlap.files import to_json
 from outlap.track.generate import BUILTIN_TRAIN
 from outlap.training.session import TrainingConfig
 
@@ -114,14 +116,16 @@ def plan_trials(sweep: SweepConfig) -> list[Trial]:
     trials = []
     for number, values in enumerate(sweep.draw()):
         races = []
+        # Not its number: other values before it would change that, and a unit with another name is done anew.
+        trial = f"trial-{hashlib.sha256(to_json(sweep.trial_config(values)).encode()).hexdigest()[:8]}"
         for seed in range(sweep.seeds):
-            name = f"trial-{number:03d}-{seed}"
+            name = f"{trial}-{seed}"
             config = sweep.trial_config(values, seed)
             tracks = sweep.tracks or config.env.tracks or BUILTIN_TRAIN
             races.append(
                 RaceUnit(
                     name=name,
-                    method=f"trial {number}",
+                    method=trial,
                     task_set="sweep",
                     table="sweep",
                     seed=seed,

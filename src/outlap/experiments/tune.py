@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
+import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,9 @@ import pandas as pd
 
 from outlap.errors import OutlapError
 from outlap.experiments.ray_engine import Surroundings, import_ray, join_cluster
-from outlap.experiments.sweep import Range, SweepConfig
+from outlap.experiments.store import Store
+from outlap.experiments.sweep import SweepConfig
+from outlap.files import to_json
 from outlap.training.run import Run, load_run
 from outlap.training.session import Progress, train
 
@@ -22,6 +27,10 @@ SCORE = "progress_m"  # of a training's recent episodes
 RETRIES = 5  # of a trial whose process or machine is lost
 FIRST_CUT = 8  # trials are compared for the first time after this part of their steps
 STEPS = "steps"
+TRIAL = "trial"
+
+OnTrials = Callable[[int, int], None]
+LISTENER: ContextVar[OnTrials | None] = ContextVar("LISTENER", default=None)  # of the search in this process
 
 
 def tune_trials(
@@ -31,7 +40,7 @@ def tune_trials(
     store: str | None = None,
     jobs: int = 0,
     gpu_share: float = 1.0,
-    on_trials: Callable[[int, int], None] | None = None,
+    on_trials: OnTrials | None = None,
 ) -> pd.DataFrame:
     """Search with Ray Tune; what was begun in the folder, or the store, goes on.
 
@@ -45,10 +54,12 @@ def tune_trials(
         on_trials: called with the trials that are done and that run, now and then.
 
     Returns:
-        A row a trial, the best first, and those that were stopped early behind the others: the values that are
-        varied, progress_m, crash_rate and mean_speed_mps of its last episodes, and the steps that it came to.
+        A row a trial, the best first, and those that were stopped early behind the others: its number in `draw`, the
+        values that are varied, progress_m, crash_rate and mean_speed_mps of its last episodes, the steps that it came
+        to, and whether it was stopped early.
 
-    Raises OutlapError where Ray is not installed, or all trials failed.
+    Raises OutlapError where Ray is not installed, another sweep was begun there, or all trials failed. A
+    KeyboardInterrupt passes through.
     """
     import_ray()
     from ray import tune
@@ -56,29 +67,35 @@ def tune_trials(
 
     if sweep.seeds != 1:
         raise OutlapError(f"seeds is {sweep.seeds}; must be 1 here: each trial is trained once")
-    for values in sweep.draw():
-        sweep.trial_config(values)  # now, and not in an hour
-    config = sweep.trial_config({})
-    total = config.total_steps
+    drawn = sweep.draw()
+    configs = [sweep.trial_config(values) for values in drawn]  # what is wrong is said now, and not in an hour
+    total = max(config.total_steps for config in configs)
+    storage = store or str(folder.absolute())
+    kept = Store(storage)
+    _claim(sweep, kept, "--store" if store else "--out")
     os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
+    os.environ["TUNE_DISABLE_SIGINT_HANDLER"] = "1"  # or Ctrl-C makes `fit` return as if all was done
+    listening = LISTENER.set(on_trials)
     began = join_cluster(address)
     try:
         surroundings = Surroundings.here()
-        gpu = {"gpu": gpu_share} if config.device.startswith("cuda") else {}
-        trainable = tune.with_resources(lambda values: _trial(sweep, values, surroundings), {"cpu": 1, **gpu})
-        storage = store or str(folder.absolute())
-        if tune.Tuner.can_restore(f"{storage}/tune"):
-            tuner = tune.Tuner.restore(f"{storage}/tune", trainable, restart_errored=True)
+        gpu = {"gpu": gpu_share} if configs[0].device.startswith("cuda") else {}
+        trainable = tune.with_resources(lambda given: _trial(sweep, given[TRIAL], surroundings), {"cpu": 1, **gpu})
+        space = {TRIAL: tune.grid_search(list(range(len(drawn))))}  # those of `outlap sweep`: they follow from the seed
+        if kept.files.glob(f"{kept.root}/tune/experiment_state-*.json"):  # Tune asks for less than it needs
+            tuner = tune.Tuner.restore(f"{storage}/tune", trainable, restart_errored=True, param_space=space)
         else:
             tuner = tune.Tuner(
                 trainable,
-                param_space={name: _space(each, grid=not sweep.trials) for name, each in sweep.search.items()},
+                param_space=space,
                 tune_config=tune.TuneConfig(
-                    metric=SCORE, mode="max", num_samples=sweep.trials or 1, max_concurrent_trials=jobs or None,
-                    scheduler=ASHAScheduler(STEPS, max_t=total, grace_period=max(1, total // FIRST_CUT)),
+                    metric=SCORE, mode="max", max_concurrent_trials=jobs or None,
+                    scheduler=ASHAScheduler(
+                        STEPS, max_t=total, grace_period=max(1, total // FIRST_CUT), stop_last_trials=False,
+                    ),
                 ),
                 run_config=tune.RunConfig(
-                    name="tune", storage_path=storage, verbose=0, callbacks=[_watch(on_trials)],
+                    name="tune", storage_path=storage, verbose=0, callbacks=[_watch()],
                     failure_config=tune.FailureConfig(max_failures=RETRIES),
                     checkpoint_config=tune.CheckpointConfig(num_to_keep=1),
                 ),
@@ -86,6 +103,7 @@ def tune_trials(
         with contextlib.redirect_stdout(io.StringIO()):  # of Tune's own tables
             results = tuner.fit()
     finally:
+        LISTENER.reset(listening)
         if began:
             import_ray().shutdown()
     rows, checkpoints = [], []
@@ -93,38 +111,43 @@ def tune_trials(
         metrics = result.metrics or {}
         if SCORE in metrics:
             told = {name: metrics[name] for name in (SCORE, "crash_rate", "mean_speed_mps", STEPS)}
-            rows.append({**(result.config or {}), **told, "stopped_early": metrics[STEPS] < total})
+            number = (result.config or {})[TRIAL]
+            early = metrics[STEPS] < configs[number].total_steps
+            rows.append({TRIAL: number, **drawn[number], **told, "stopped_early": early})
             checkpoints.append(result.checkpoint)
     if not rows:
         raise OutlapError(f"{storage}: no trial came to a result: {next(iter(results.errors), 'no episode ended')}")
     found = pd.DataFrame(rows).sort_values(["stopped_early", SCORE], ascending=[True, False], kind="stable")
     best = checkpoints[int(found.index[0])]
     if best is not None:
+        shutil.rmtree(folder / "best", ignore_errors=True)  # of a trial that was the best so far
         best.to_directory(folder / "best")
     return found.reset_index(drop=True)
 
 
-def _space(values: Any, grid: bool) -> Any:
-    """What Tune draws from."""
-    from ray import tune
+def _claim(sweep: SweepConfig, store: Store, flag: str) -> None:
+    """Keep the sweep beside Tune's files. Raises OutlapError, with the flag to change, where they are another's."""
+    path, new = f"{store.root}/sweep.json", to_json(sweep) + "\n"
+    if store.files.exists(path):
+        begun = json.loads(store.files.cat_file(path))
+    elif store.files.exists(f"{store.root}/tune"):
+        begun = {}
+    else:
+        store.files.makedirs(store.root, exist_ok=True)
+        store.files.pipe_file(f"{path}.partial", new.encode())
+        store.files.mv(f"{path}.partial", path)
+        return
+    other = [name for name, value in json.loads(new).items() if name not in begun or begun[name] != value]
+    if other:
+        raise OutlapError(f"{store.url}: a search with other {', '.join(other)} was begun there; give another {flag}")
 
-    if isinstance(values, Range):
-        match values.distribution:
-            case "uniform":
-                return tune.uniform(values.low, values.high)
-            case "log_uniform":
-                return tune.loguniform(values.low, values.high)
-            case "integer":
-                return tune.randint(int(values.low), int(values.high) + 1)
-    return tune.grid_search(list(values)) if grid else tune.choice(list(values))
 
-
-def _trial(sweep: SweepConfig, values: Mapping[str, Any], surroundings: Surroundings) -> None:
-    """Train with some values, in a process of Tune's."""
+def _trial(sweep: SweepConfig, number: int, surroundings: Surroundings) -> None:
+    """Train with the values of a trial, in a process of Tune's."""
     from ray import tune
 
     surroundings.settle_in()
-    config = sweep.trial_config(values)
+    config = sweep.trial_config(sweep.draw()[number])
     with tempfile.TemporaryDirectory(prefix="outlap-") as scratch:
         folder = Path(scratch) / "run"
         kept = tune.get_checkpoint()
@@ -147,24 +170,32 @@ def _trial(sweep: SweepConfig, values: Mapping[str, Any], surroundings: Surround
                     "mean_speed_mps": progress.mean_speed_mps,
                 }
             )
+            if progress.steps >= config.total_steps:  # the last report comes with the finished policy
+                return
             there = Run(folder, config).checkpoints()
             new = there != known
             known = there
             tune.report(dict(latest), checkpoint=tune.Checkpoint.from_directory(str(folder)) if new else None)
 
-        train(config, folder, resume=begun, on_progress=report)
+        run = train(config, folder, resume=begun, on_progress=report)
         if latest:
+            latest[STEPS] = run.record()[STEPS]
             tune.report(dict(latest), checkpoint=tune.Checkpoint.from_directory(str(folder)))
 
 
-def _watch(on_trials: Callable[[int, int], None] | None) -> Any:
+def _watch() -> Any:
+    """A callback that tells whoever listens. Tune keeps it in a file, of which a search that goes on takes it."""
     from ray.tune import Callback
 
     class Watch(Callback):
         """Counts the trials that are done."""
 
         def on_step_end(self, iteration: int, trials: list, **_: Any) -> None:
-            if on_trials is not None:
-                on_trials(sum(t.is_finished() for t in trials), sum(t.status == "RUNNING" for t in trials))
+            tell = LISTENER.get()
+            if tell is not None:
+                tell(sum(t.is_finished() for t in trials), sum(t.status == "RUNNING" for t in trials))
+
+        def __reduce__(self) -> tuple[Any, tuple]:
+            return _watch, ()
 
     return Watch()
