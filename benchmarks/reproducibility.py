@@ -93,12 +93,13 @@ def _small(config, **changes):
 
 def _trained(config, path: Path) -> str:
     """Learning curve and final weights."""
+    from outlap.training.model_file import load_model
     from outlap.training.session import train
 
     rows: list[tuple] = []
     keep = ("steps", "crash_rate", "mean_speed_mps", "progress_m")
     run = train(config, path, on_progress=lambda now: rows.append(tuple(getattr(now, name) for name in keep)))
-    policy = config.model_class().load(run.policy_path, device="cpu").policy
+    policy = load_model(config, run.policy_path).policy
     return digest(rows, *(value.numpy() for value in policy.state_dict().values()))
 
 

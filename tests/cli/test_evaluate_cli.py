@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for radius in (5.0, 4.0):
         track = ring(radius=radius)
         track.save(folder / "maps" / track.name)
-    run = create_run(folder / "run", PPOConfig(env=ENV, held_out_tracks=("ring4",)))
+    run = create_run(folder / "run", PPOConfig(env=ENV, held_out_tracks=("ring4",), net_arch=(16, 16)))
     untrained_ppo(ENV, ring(radius=5.0)).save(run.folder / "policy.zip")
     return folder
 
@@ -190,9 +190,9 @@ def test_wrong_runs_are_one_line(made, fail, tmp_path):
 
 
 def test_a_policy_of_another_configuration_is_refused(made, fail, tmp_path):
-    run = create_run(tmp_path / "edited", PPOConfig(env=ENV))
+    run = create_run(tmp_path / "edited", PPOConfig(env=ENV, net_arch=(16, 16)))
     (run.folder / "policy.zip").write_bytes((made / "run" / "policy.zip").read_bytes())
-    save_config(PPOConfig(env=ENV.model_copy(update={"beams": 20})), run.folder / "config.yaml")
+    save_config(PPOConfig(env=ENV.model_copy(update={"beams": 20}), net_arch=(16, 16)), run.folder / "config.yaml")
     line = fail(str(run.folder), "--tracks", "ring4", "--out", "x", "--quiet")
     assert "trained on 10 numbers of 'scan' and would be shown 20" in line
 

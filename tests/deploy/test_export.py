@@ -55,9 +55,10 @@ def run_of(config: type[TrainingConfig], folder: Path, track: str, env: dict[str
         (RecurrentPPOConfig, {**ENV, "scale_observations": True}, {**PPO, "lstm_hidden": 8}),
         (MQLConfig, META, {**SMALL, "preset": "fast"}),
         (MQLConfig, META, {**SMALL, "preset": "paper", "history": 4}),
+        (MQLConfig, {**ENV, "reward": "paper"}, {**SMALL, "preset": "fast", "uses_reward": False}),
         (MQLConfig, ENV, {**SMALL, "preset": "fast", "uses_context": False, "uses_reward": False}),
     ],
-    ids=["ppo", "recurrent-ppo", "mql-fast", "mql-paper", "td3"],
+    ids=["ppo", "recurrent-ppo", "mql-fast", "mql-paper", "mql-without-reward", "td3"],
 )
 def test_the_file_does_what_the_policy_does(tmp_path: Path, track: str, config, env, settings):
     run = run_of(config, tmp_path / "run", track, env, **settings)
@@ -99,6 +100,31 @@ def test_what_a_car_cannot_tell_is_refused(tmp_path: Path, track: str):
         with pytest.raises(OutlapError, match=said):
             export_policy(run, tmp_path / "policy.onnx")
     assert not (tmp_path / "policy.onnx").exists()
+
+
+@pytest.mark.parametrize("output", ["action", "command"])
+def test_a_file_that_gives_nan_is_refused_and_removed(
+    tmp_path: Path, track: str, output: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    run = run_of(PPOConfig, tmp_path / "run", track, ENV, **PPO)
+    path = run.folder / "policy.onnx"
+
+    def export_broken(run: Run, path: Path) -> dict[str, Any]:
+        facts = export_policy(run, path)
+        proto = onnx.load(path)
+        for node in proto.graph.node:
+            node.output[:] = ["before" if name == output else name for name in node.output]
+            node.input[:] = ["before" if name == output else name for name in node.input]
+        nothing = onnx.helper.make_tensor("nothing", onnx.TensorProto.FLOAT, [2], [np.nan, 0.0])
+        proto.graph.initializer.append(nothing)
+        proto.graph.node.append(onnx.helper.make_node("Add", ["before", "nothing"], [output]))
+        onnx.save(proto, path)
+        return facts
+
+    monkeypatch.setattr("outlap.deploy.export.export_policy", export_broken)
+    assert main(["export", str(run.folder), "--steps", "20"]) == 2
+    assert "nan in its " + output in capfd.readouterr()[1]
+    assert not path.exists()
 
 
 def test_files_that_are_no_exported_policy(tmp_path: Path, track: str):

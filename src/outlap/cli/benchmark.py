@@ -237,7 +237,7 @@ def _measure_mql(settings: BenchmarkMQL, preset: str, beams: int, batch: int) ->
             "buffer_size": 1000 * MQL_WORLDS,
         }
     )  # fmt: skip
-    model = config.make_model(SB3VecEnv(MQL_WORLDS, **dict(env)))
+    model: Any = config.make_model(SB3VecEnv(MQL_WORLDS, **dict(env)))
     model.learn((FILLED + 4) * MQL_WORLDS)
     updates, rates = [], []
     for _ in range(settings.repeats):
@@ -287,7 +287,7 @@ class BenchmarkRacing:
     """Drivers and populations; the training half of the one that comes with outlap by default."""
 
     opponent_code: FlagCreatePairsOff[bool] = False
-    """Load opponents that can run code when they are loaded: run folders, module:function."""
+    """Import modules for opponents, module:function, which runs their code."""
 
     worlds: int = 128
     """Races in lock-step."""

@@ -38,7 +38,7 @@ class RaceFlags:
     """Drivers and populations to draw opponents from, in place of the run's; one where the run had none."""
 
     opponent_code: Flag = False
-    """Load opponents that can run code when they are loaded: run folders, module:function."""
+    """Import modules for opponents, module:function, which runs their code; no run's configuration allows it."""
 
     opponent_split: Literal["train", "held_out"] = "held_out"
     """The half of a population that opponents are drawn from."""
@@ -74,13 +74,11 @@ class RaceFlags:
         return Subject(driver, env, run, task)
 
     def _as_asked(self, env: RaceConfig) -> RaceConfig:
-        changes: dict[str, Any] = {"opponent_split": self.opponent_split}
+        changes: dict[str, Any] = {"opponent_split": self.opponent_split, "opponent_code": self.opponent_code}
         if self.num_cars is not None:
             changes["num_cars"] = self.num_cars
         if self.opponents:
             changes |= {"num_cars": max(2, env.num_cars), **changes, "opponents": self.opponents}
-        if self.opponent_code:
-            changes["opponent_code"] = True
         if self.racing_line is not None:
             changes["racing_line"] = self.racing_line
         if self.formation:

@@ -47,6 +47,9 @@ class Reproduce(WorkFlags):
     out: Path | None = None
     """The folder for the report and the work; by default runs/reproduce-BUDGET."""
 
+    driver_code: FlagCreatePairsOff[bool] = False
+    """Import modules that a method's file names as its driver, module:function, which runs their code."""
+
     dry_run: FlagCreatePairsOff[bool] = False
     """Say what there is to do, and do nothing."""
 
@@ -62,7 +65,7 @@ class Reproduce(WorkFlags):
 
         self.check_flags()
         check_least("--seeds", 1 if self.seeds is None else self.seeds, 1)
-        plan = make_plan(self.wanted, self.budget, self.methods, self.seeds)
+        plan = make_plan(self.wanted, self.budget, self.methods, self.seeds, self.driver_code)
         folder = self.out or Path("runs") / f"reproduce-{plan.budget_name}"
         work = folder / "work"
         if self.dry_run:

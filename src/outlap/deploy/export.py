@@ -28,6 +28,7 @@ from outlap.envs.observations import scale_of
 from outlap.errors import OutlapError
 from outlap.files import atomic_write
 from outlap.mql.networks import PREVIOUS_REWARD, ContextEncoder
+from outlap.training.model_file import load_model
 
 if TYPE_CHECKING:
     from outlap.deploy.car_driver import CarDriver
@@ -50,9 +51,11 @@ def export_policy(run: Run, path: str | os.PathLike[str]) -> dict[str, Any]:
         import onnx
     except ImportError:
         raise OutlapError("onnx is not installed; pip install 'outlap[deploy]'") from None
-    model = run.config.model_class().load(run.policy_path, device="cpu")
-    space = model.observation_space
-    assert isinstance(space, gym.spaces.Dict)
+    model = load_model(run.config, run.policy_path)
+    observed = model.observation_space
+    assert isinstance(observed, gym.spaces.Dict)
+    reads_reward = getattr(model.policy, "uses_reward", True)
+    space = gym.spaces.Dict({name: observed[name] for name in observed if reads_reward or name != PREVIOUS_REWARD})
     facts = describe(run, space)
     graph = Graph(_policy(model.policy), space, facts, run.config.env.scale_observations).eval()
     names = [name for name in facts["terms"] if name != PREVIOUS_ACTION]
@@ -111,7 +114,7 @@ def describe(run: Run, space: gym.spaces.Dict) -> dict[str, Any]:
     if PREVIOUS_REWARD in terms and unknown:
         raise OutlapError(
             f"{run.folder}: observes rewards for {unknown[0]}, which a car cannot tell; train with another reward, or "
-            "without previous_reward"
+            "without previous_reward (Meta-Q-Learning: with --no-uses-reward)"
         )
     vehicle = env.vehicle
     slowest, fastest = env.speed_range or (bounds(vehicle.v_min)[0], None)
@@ -284,7 +287,7 @@ def compare(
         on_step: called with the number of actions that are compared.
 
     Returns:
-        The largest difference of an action (in [-1, 1]) and of a command ([rad] or [m/s]).
+        The largest difference of an action (in [-1, 1]) and of a command ([rad] or [m/s]); NaN where either has one.
     """
     from outlap.envs.actions import commands
     from outlap.envs.race import EGO
@@ -307,8 +310,9 @@ def compare(
         )
         action = np.clip(action, -1.0, 1.0)
         wanted = commands(action, race.race.worlds.params[:, EGO], race.race.speeds[:, EGO])
-        of_action = max(of_action, float(np.abs(action[0] - driver.action).max()))
-        of_command = max(of_command, float(np.abs(wanted[0] - command).max()))
+        # NumPy's maximum keeps a NaN, and Python's does not.
+        of_action = float(np.maximum(of_action, np.abs(action[0] - driver.action).max()))
+        of_command = float(np.maximum(of_command, np.abs(wanted[0] - command).max()))
         observation, _, terminated, truncated, _ = race.step(action)
         begins = terminated | truncated
         if on_step is not None:

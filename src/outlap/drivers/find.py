@@ -36,7 +36,7 @@ def find_drivers(
         names: see OFFERED.
         field_of_view: [rad] of the scanners, for those that look.
         split: the half of a population; None: both.
-        run_code: load what can run code when it is loaded: the Stable-Baselines3 zip of a run, and modules.
+        run_code: import modules, which runs their code.
 
     Raises OutlapError for a name that is none of these, for what cannot be loaded, and for what may not be.
     """
@@ -64,16 +64,16 @@ def _drivers(name: Named, field_of_view: float, split: Split | None, run_code: b
         return load_population(path, split)
     if path.suffix == ".csv":
         return [Ghost.load(path)]
-    is_run = (path / "config.yaml").is_file()
+    if (path / "config.yaml").is_file():
+        return [_run(path)]
     module, _, function = text.partition(":")
-    if is_run or (function and module.replace(".", "").isidentifier()):
+    if function and module.replace(".", "").isidentifier():
         if not run_code:
-            what = "a Stable-Baselines3 zip" if is_run else "a module"
             raise OutlapError(
-                f"driver {text}: is {what}, which can run code when it is loaded; allow that with opponent_code if you "
-                "trust it"
+                f"driver {text}: is a module, which runs code when it is imported; if you trust it, allow that with "
+                "opponent_code, or outlap reproduce --driver-code"
             )
-        return [_run(path) if is_run else _function(module, function)]
+        return [_function(module, function)]
     if path.is_dir():
         raise OutlapError(f"{text}: holds neither a run (no config.yaml) nor a population (no {MANIFEST})")
     if (path.parent / MANIFEST).is_file():

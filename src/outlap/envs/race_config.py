@@ -38,7 +38,7 @@ class RaceConfig(SimulatorConfig):
     num_cars: int = Field(default=1, ge=1, le=64)  # the ego and its opponents
     opponents: tuple[str, ...] = ("pure-pursuit",)  # see drivers.find; one driver is drawn per opponent and reset
     opponent_split: Literal["train", "held_out"] = "train"  # the half of a population; training takes no other
-    opponent_code: bool = False  # whether opponents may run code when loaded: zips of runs, module:function
+    opponent_code: bool = False  # whether modules may be imported for opponents, module:function
     opponent_crash: Literal["park", "remove", "respawn"] = "park"  # what becomes of an opponent that crashed
     opponent_speed: Annotated[Number, bounded(at_least=0)] | None = None  # their cars' top speed [m/s], drawn likewise
     opponent_noise: Annotated[Number, bounded(at_least=0)] = 0.0  # standard deviation of their actions, likewise

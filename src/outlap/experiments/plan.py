@@ -88,6 +88,7 @@ def make_plan(
     budget_name: str,
     methods: Sequence[str] = (),
     seeds: int | None = None,
+    run_code: bool = False,
 ) -> Plan:
     """What some tables and figures need.
 
@@ -96,10 +97,11 @@ def make_plan(
         budget_name: or its file.
         methods: names or files; none: all that come with outlap.
         seeds: in place of the budget's.
+        run_code: import modules that a method's file names as its driver, which runs their code.
 
     Raises OutlapError for a name that is not known, and a definition that is not valid.
     """
-    return _Planner(budget_name, methods, seeds).plan(wanted)
+    return _Planner(budget_name, methods, seeds, run_code).plan(wanted)
 
 
 def remember_tracks(names: Iterable[str], work: Path) -> dict[str, str]:
@@ -118,7 +120,7 @@ def remember_tracks(names: Iterable[str], work: Path) -> dict[str, str]:
 
 
 class _Planner:
-    def __init__(self, budget_name: str, methods: Sequence[str], seeds: int | None) -> None:
+    def __init__(self, budget_name: str, methods: Sequence[str], seeds: int | None, run_code: bool) -> None:
         self.budget_name, budget = find(Budget, budget_name)
         self.budget = budget if seeds is None else budget.model_copy(update={"seeds": seeds})
         self.task_sets = dict(find(TaskSet, name) for name in names_of(TaskSet))
@@ -135,7 +137,7 @@ class _Planner:
             self.methods[name] = method
         for name, method in self.methods.items():
             if method.driver is not None:
-                find_drivers([method.driver], PPOConfig().env.field_of_view, split=None, run_code=True)
+                find_drivers([method.driver], PPOConfig().env.field_of_view, split=None, run_code=run_code)
             for other in method.against:
                 if other not in (*self.methods, *names_of(Method)):
                     raise OutlapError(f"method {name}: is to be compared with {other!r}, and no method is called so")

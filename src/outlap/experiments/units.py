@@ -18,7 +18,7 @@ from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.definitions import changed
 from outlap.experiments.population import PopulationUnit
 from outlap.experiments.unit import Report, Unit
-from outlap.training.mql import MQLConfig
+from outlap.training.mql import MQLConfig, load_meta
 from outlap.training.ppo import PPOConfig
 from outlap.training.session import TrainingConfig
 
@@ -145,7 +145,7 @@ class RaceUnit(Unit):
         from outlap.evaluation.rollout import EvaluationProgress, evaluate, standing_starts
         from outlap.track.track import Track
 
-        meta = load_meta(self.training, work) if self.adaptation is not None and self.training else None
+        meta = load_meta(self.training.run(work)) if self.adaptation is not None and self.training else None
         rows = []
         for number, task in enumerate(self.tasks):
             track = Track.load(task.track)
@@ -214,7 +214,7 @@ class ClippingUnit(Unit):
         from outlap.experiments.clipping import compare_rules
         from outlap.mql.adaptation import collect
 
-        meta = load_meta(self.training, work)
+        meta = load_meta(self.training.run(work))
         base = adaptation_settings({"clip": "abc", **self.settings})
         task = collecting(self.training, self.task, work, self.adaptation_seed)
         new = collect(meta, task, base, seed=self.adaptation_seed)
@@ -228,16 +228,6 @@ def _seconds_of_adaptation(settings: AdaptationSettings) -> float:
     """About how long its updates take."""
     updates = settings.iterations * (settings.on_task_steps + settings.replay_steps)
     return 0.025 * updates * settings.batch_size / 256
-
-
-def load_meta(unit: TrainingUnit, work: Path) -> MQL:
-    """A meta-trained policy with its replay."""
-    from outlap.mql.mql import MQL
-
-    run = unit.run(work)
-    meta = MQL.load(run.policy_path, device=run.config.device)
-    meta.load_replay_buffer(run.replay_path)
-    return meta
 
 
 def collecting(unit: TrainingUnit, task: Task, work: Path, seed: int):

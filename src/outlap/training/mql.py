@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 from tyro.conf import arg
 
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
+from outlap.errors import OutlapError
+from outlap.training.model_file import load_model
 from outlap.training.ppo import PPOConfig
 from outlap.training.session import RECENT_EPISODES, TrainingConfig
 
 if TYPE_CHECKING:
-    from outlap.envs.sb3_vec_env import SB3VecEnv
     from outlap.mql.mql import MQL
+    from outlap.training.run import Run
 
 
 class MQLConfig(TrainingConfig):
     """A meta-training. The defaults are for two cores; `--preset paper` has the paper's networks."""
+
+    policy_name = "MQLPolicy"
 
     algorithm: Literal["mql"] = "mql"  # type: ignore[assignment]
     env: RaceConfig = PPOConfig().env.model_copy(
@@ -62,38 +66,47 @@ class MQLConfig(TrainingConfig):
         """See `TrainingConfig`: episodes."""
         return self.num_envs
 
-    def make_model(self, environment: SB3VecEnv) -> MQL:
+    def constants(self) -> dict[str, Any]:
         """See `TrainingConfig`."""
-        from outlap.mql.mql import MQL
+        return {
+            "learning_rate": self.schedule(),
+            "buffer_size": self.buffer_size,
+            "learning_starts": self.learning_starts,
+            "batch_size": self.batch_size,
+            "tau": self.tau,
+            "gamma": self.gamma,
+            "train_freq": 1,
+            "gradient_steps": self.updates_per_step,
+            "n_steps": self.n_steps,
+            "exploration_noise": self.exploration_noise,
+            "policy_noise": self.policy_noise,
+            "noise_clip": self.noise_clip,
+            "policy_delay": self.policy_delay,
+            "stats_window_size": RECENT_EPISODES,
+            "seed": self.seed,
+            "device": self.device,
+        }
 
-        return MQL(
-            "MQLPolicy",
-            environment,  # type: ignore[arg-type]
-            learning_rate=self.schedule(),
-            buffer_size=self.buffer_size,
-            learning_starts=self.learning_starts,
-            batch_size=self.batch_size,
-            tau=self.tau,
-            gamma=self.gamma,
-            gradient_steps=self.updates_per_step,
-            n_steps=self.n_steps,
-            exploration_noise=self.exploration_noise,
-            policy_noise=self.policy_noise,
-            noise_clip=self.noise_clip,
-            policy_delay=self.policy_delay,
-            policy_kwargs={
-                "preset": self.preset,
-                "history": self.history,
-                "uses_reward": self.uses_reward,
-                "uses_context": self.uses_context,
-            },
-            stats_window_size=RECENT_EPISODES,
-            seed=self.seed,
-            device=self.device,
-        )
+    def network(self) -> dict[str, Any]:
+        """See `TrainingConfig`."""
+        return {
+            "preset": self.preset,
+            "history": self.history,
+            "uses_reward": self.uses_reward,
+            "uses_context": self.uses_context,
+        }
 
     def model_class(self) -> type[MQL]:
         """See `TrainingConfig`."""
         from outlap.mql.mql import MQL
 
         return MQL
+
+
+def load_meta(run: Run) -> MQL:
+    """A meta-trained policy with its replay. Raises OutlapError for a run of another algorithm, and broken files."""
+    if run.config.algorithm != "mql":
+        raise OutlapError(f"{run.folder}: was trained with {run.config.algorithm}; must be one of outlap train mql")
+    meta: Any = load_model(run.config, run.policy_path, device=run.config.device)
+    meta.load_replay_buffer(run.replay_path)
+    return meta

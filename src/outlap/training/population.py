@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import CRASH
 from outlap.evaluation.rollout import evaluate, made_for, standing_starts
 from outlap.track.track import Track
+from outlap.training.model_file import load_model
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
 from outlap.training.session import train
@@ -97,12 +99,9 @@ def train_opponent(
     Returns:
         Its driver, not verified yet.
     """
-    from stable_baselines3 import PPO
-
     config = opponent_config(settings, track, opponent.max_speed_mps)
     begun = load_run(folder) if (folder / "config.yaml").is_file() else None
     run = train(config, folder, resume=begun, on_progress=lambda progress: on_steps(progress.steps))
-    return MLPDriver.from_ppo(
-        PPO.load(run.policy_path, device="cpu"), opponent.name, config.env.scale_observations,
-        (SLOWEST, opponent.max_speed_mps),
-    )  # fmt: skip
+    model: Any = load_model(run.config, run.policy_path)
+    speeds = SLOWEST, opponent.max_speed_mps
+    return MLPDriver.from_ppo(model, opponent.name, config.env.scale_observations, speeds)

@@ -14,11 +14,11 @@ from outlap.training.session import RECENT_EPISODES, TrainingConfig
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from outlap.envs.sb3_vec_env import SB3VecEnv
-
 
 class PPOConfig(TrainingConfig):
     """A PPO training. The defaults learn to lap circuits that they never saw within minutes on two cores."""
+
+    policy_name = "MultiInputPolicy"
 
     algorithm: Literal["ppo"] = "ppo"  # type: ignore[assignment]
     env: RaceConfig = RaceConfig(
@@ -45,14 +45,8 @@ class PPOConfig(TrainingConfig):
     activation: Literal["tanh", "relu"] = "tanh"
     log_std_init: float = -0.5  # log of the initial standard deviation of an action
 
-    def make_model(self, environment: SB3VecEnv) -> BaseAlgorithm:
-        """See `TrainingConfig`."""
-        from stable_baselines3 import PPO
-
-        return PPO("MultiInputPolicy", environment, **self.constants(), policy_kwargs=self.network())
-
     def constants(self) -> dict[str, Any]:
-        """What the algorithm is built with, but its networks."""
+        """See `TrainingConfig`."""
         return {
             "learning_rate": self.schedule(),
             "n_steps": self.n_steps,
@@ -70,7 +64,7 @@ class PPOConfig(TrainingConfig):
         }
 
     def network(self) -> dict[str, Any]:
-        """Policy and value function."""
+        """See `TrainingConfig`: policy and value function."""
         import torch
 
         return {

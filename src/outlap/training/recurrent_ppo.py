@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -11,30 +11,19 @@ from outlap.training.ppo import PPOConfig
 if TYPE_CHECKING:
     from sb3_contrib import RecurrentPPO
 
-    from outlap.envs.sb3_vec_env import SB3VecEnv
-
 
 class RecurrentPPOConfig(PPOConfig):
     """A training of PPO whose policy and value function share what an LSTM remembers of the episode."""
 
+    policy_name = "MultiInputLstmPolicy"
+
     algorithm: Literal["recurrent-ppo"] = "recurrent-ppo"  # type: ignore[assignment]
     lstm_hidden: int = Field(default=64, ge=1)
 
-    def make_model(self, environment: SB3VecEnv) -> RecurrentPPO:
+    def network(self) -> dict[str, Any]:
         """See `TrainingConfig`."""
-        from sb3_contrib import RecurrentPPO
-
-        return RecurrentPPO(
-            "MultiInputLstmPolicy",
-            environment,
-            **self.constants(),
-            policy_kwargs={
-                **self.network(),
-                "lstm_hidden_size": self.lstm_hidden,
-                "shared_lstm": True,
-                "enable_critic_lstm": False,
-            },
-        )
+        memory = {"lstm_hidden_size": self.lstm_hidden, "shared_lstm": True, "enable_critic_lstm": False}
+        return {**super().network(), **memory}
 
     def model_class(self) -> type[RecurrentPPO]:
         """See `TrainingConfig`."""

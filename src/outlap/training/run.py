@@ -11,6 +11,7 @@ tensorboard/
 from __future__ import annotations
 
 import json
+import logging
 import os
 import platform
 import re
@@ -26,10 +27,13 @@ from typing import TYPE_CHECKING, Any
 from outlap.config import read_yaml, save_config, validate
 from outlap.errors import OutlapError
 from outlap.files import atomic_write, replacing, to_json
+from outlap.training.model_file import load_model
 
 if TYPE_CHECKING:
     from outlap.drivers.policy import PolicyDriver
     from outlap.training.session import TrainingConfig
+
+log = logging.getLogger(__name__)
 
 CHECKPOINTS_KEPT = 3
 PACKAGES = ("outlap", "numpy", "numba", "torch", "stable-baselines3", "gymnasium")
@@ -54,6 +58,8 @@ class Run:
         for path in (self.folder / "policy.zip", *self.checkpoints()):
             if zipfile.is_zipfile(path):
                 return path
+            if path.exists():
+                log.warning("%s: is broken; the checkpoint before it is taken", path)
         command = f"outlap train {self.config.algorithm} --resume {self.folder}"
         raise OutlapError(f"{self.folder}: holds no policy yet; train it with: {command}")
 
@@ -64,13 +70,12 @@ class Run:
         return finished if finished.exists() else max(self.replays(), key=_steps_of, default=finished)
 
     def driver(self, *, deterministic: bool = True, seed: int = 0) -> PolicyDriver:
-        """The policy as a driver. Its zip can run code when it is loaded: load those of people you trust."""
+        """The policy as a driver."""
         from outlap.drivers.policy import PolicyDriver
 
         env = self.config.env
-        return PolicyDriver.load(
-            self.policy_path,
-            algorithm=self.config.model_class(),
+        return PolicyDriver(
+            load_model(self.config, self.policy_path),
             scale_observations=env.scale_observations,
             deterministic=deterministic,
             seed=seed,

@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -20,6 +20,7 @@ from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
 from outlap.files import remove_partials
+from outlap.training.model_file import load_model
 from outlap.training.run import Run, create_run, save_checkpoint
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ RECENT_EPISODES = 500  # over which training statistics are taken; a checkpoint 
 
 class TrainingConfig(Config):
     """A training. Each algorithm has its own, named by the field `algorithm`."""
+
+    policy_name: ClassVar[str]  # of the networks, as the algorithm calls them
 
     algorithm: str
     env: RaceConfig = RaceConfig()
@@ -58,12 +61,21 @@ class TrainingConfig(Config):
         return env
 
     @abstractmethod
-    def make_model(self, environment: SB3VecEnv) -> BaseAlgorithm:
-        """A model that has learnt nothing yet."""
+    def model_class(self) -> type[BaseAlgorithm]:
+        """The algorithm."""
 
     @abstractmethod
-    def model_class(self) -> type[BaseAlgorithm]:
-        """What `load` reads back a model with."""
+    def constants(self) -> dict[str, Any]:
+        """What the algorithm is built with, but its networks."""
+
+    @abstractmethod
+    def network(self) -> dict[str, Any]:
+        """What the networks are built with."""
+
+    def make_model(self, environment: SB3VecEnv) -> BaseAlgorithm:
+        """A model that has learnt nothing yet."""
+        networks = {"policy_kwargs": self.network()}
+        return self.model_class()(self.policy_name, environment, **self.constants(), **networks)  # type: ignore[arg-type]
 
     @property
     def report_every(self) -> int:
@@ -213,13 +225,15 @@ def _begin_episodes(model: Any) -> None:
 
 
 def _newest_model(run: Run, environment, config: TrainingConfig):
-    """The newest checkpoint that can be read, or None."""
+    """The newest checkpoint that can be read; None where there is none. Raises OutlapError where none can be read."""
+    error = None
     for path in run.checkpoints():
         try:
-            model = config.model_class().load(path, env=environment, device=config.device)
-        except Exception as error:  # whatever a broken file raises: the one before may be whole
+            model = load_model(config, path, environment, config.device)
+        except OutlapError as wrong:  # the one before may be whole
             log.warning("%s: cannot be read, and is left out; the one before is taken", path)
-            run.write_record(**{f"unreadable_{path.name}": str(error)})
+            run.write_record(**{f"unreadable_{path.name}": str(wrong)})
+            error = error or wrong
             continue
         own = path.with_suffix(".npz")
         replay = own if own.exists() else run.replay_path
@@ -229,6 +243,8 @@ def _newest_model(run: Run, environment, config: TrainingConfig):
             except OutlapError as error:
                 log.warning("%s; the training goes on with an empty one", error)
         return model
+    if error is not None:
+        raise OutlapError(f"{error}; nor can those before; remove {run.folder}/checkpoints to begin anew") from error
     return None
 
 
