@@ -14,6 +14,7 @@ from outlap.cli.main import main
 from outlap.evaluation.metrics import summarise_methods
 from outlap.evaluation.recording import Recording
 from outlap.evaluation.rollout import evaluate
+from outlap.mql.adaptation import adapt
 from synthetic_tracks import ring
 
 SMALL = [
@@ -53,6 +54,7 @@ def test_train_evaluate_and_adapt(run: Path, capfd: pytest.CaptureFixture[str]) 
     updates = pd.read_parquet("adapted/updates.parquet")
     assert len(updates) == 2 * 3 * 2
     assert {"beta_mean", "clip_level", "clipped_share", "effective_sample_size", "proximal_weight"} <= set(updates)
+    assert updates["classifier_accuracy"].between(0.5, 1.0).all()
     # The same episode before and after, in this order, with the context that the policy acted on.
     files = sorted(Path("adapted/recordings").iterdir())
     assert [file.stem for file in files] == [f"ring6-000-{name}" for name in ("0-before", "1-none", "2-fixed", "3-abc")]
@@ -96,6 +98,33 @@ def test_an_adaptation_goes_on_where_it_was_interrupted(
     assert {path.name for path in folder.rglob("*")} == {path.name for path in Path("whole").rglob("*")}
     assert main([*words, "--out", str(folder)]) == 2
     assert "must be an empty or a new folder" in capfd.readouterr()[1]
+
+
+def test_adapting_goes_on_with_the_rewards_that_training_ended_with(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    began_at = []
+
+    def noting(meta, task, *args, **settings):
+        began_at.append(task.env.training_steps)
+        return adapt(meta, task, *args, **settings)
+
+    monkeypatch.setattr("outlap.mql.adaptation.adapt", noting)
+    words = ["adapt", "run", "--tracks", "ring6", "--seeds", "1", "--clip", "none", *SHORT, "--time-limit", "1"]
+    assert main([*words, "--quiet"]) == 0
+    assert began_at == [64]
+
+
+def test_a_folder_of_somebody_else_is_left_as_it_is(run: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    drawing = Path("car/parts/chassis.dxf")
+    drawing.parent.mkdir(parents=True)
+    drawing.touch()
+    words = ["adapt", "run", "--tracks", "ring6", *SHORT, "--quiet", "--out"]
+    assert main([*words, "car"]) == 2
+    assert "car: is there already; must be an empty or a new folder" in capfd.readouterr()[1]
+    assert drawing.exists()
+    # What a process leaves that was killed before it had noted anything is no work of anybody.
+    Path("killed/parts").mkdir(parents=True)
+    Path("killed/parts/.lock").touch()
+    assert main([*words, "killed", "--seeds", "1", "--clip", "none", "--time-limit", "1"]) == 0
 
 
 def test_wrong_arguments_are_one_line(run: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -627,6 +627,15 @@ def test_tasks_are_loaded_as_what_they_were(tmp_path: Path) -> None:
     assert loaded.tasks == names
 
 
+def test_a_task_is_what_a_file_can_tell() -> None:
+    assert [task_of({"task": task}) for task in (np.int64(7), np.str_("oval"))] == [7, "oval"]
+    assert type(task_of({"task": np.int64(7)})) is int
+    assert task_of({"track": "oval"}) == "oval"
+    assert task_of({}) is None
+    with pytest.raises(OutlapError, match=r"a world's task is \(1, 2\); must be a string, a whole number or None"):
+        task_of({"task": (1, 2)})
+
+
 RACE = {"scan": 540, "vel": 3, "heading": 2, "pose": 3}
 
 

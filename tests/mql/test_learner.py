@@ -102,21 +102,28 @@ def test_an_update_is_a_plain_td3_step_of_both_losses(preset: str, n_steps: int)
     assert record["actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-5)
     assert record["critic_loss_variance"].item() == pytest.approx((weights * each).var().item(), rel=1e-4)
     assert record["td_error"].item() == pytest.approx(each.mean().item(), rel=1e-5)
-    critics, context = list(theirs.critic.parameters()), list(theirs.context.parameters())
+    # Where the context reads embeddings, the actor's loss reaches their encoder too.
+    heads, seen = list(theirs.critic.heads.parameters()), list(theirs.critic.encoder.parameters())
+    context = list(theirs.context.parameters())
     actors = list(theirs.actor_optimizer.param_groups[0]["params"])
-    of_critic = torch.autograd.grad(critic_loss, [*critics, *context], retain_graph=True)
-    of_actor = torch.autograd.grad(actor_loss, [*context, *actors])
-    with torch.no_grad():
-        for parameter, gradient in zip(critics, of_critic[: len(critics)], strict=True):
-            parameter.grad = gradient
-        for i, parameter in enumerate(context):  # both losses reach the context
-            assert of_critic[len(critics) + i].abs().max() > 0
-            assert of_actor[i].abs().max() > 0
-            parameter.grad = of_critic[len(critics) + i] + of_actor[i]
-        for parameter, gradient in zip(actors, of_actor[len(context) :], strict=True):
-            parameter.grad = gradient
-    torch.nn.utils.clip_grad_norm_([*critics, *context], STILL.max_grad_norm)
+    both = [*seen, *context]
+    of_critic = torch.autograd.grad(critic_loss, [*heads, *both], retain_graph=True)
+    of_actor = torch.autograd.grad(actor_loss, [*both, *actors], materialize_grads=True)
+    for parameter, gradient in zip(heads, of_critic, strict=False):
+        parameter.grad = gradient
+    for parameter, one, other in zip(both, of_critic[len(heads) :], of_actor, strict=False):
+        parameter.grad = one + other
+    for parameter, gradient in zip(actors, of_actor[len(both) :], strict=True):
+        parameter.grad = gradient
+    for gradient in (*of_critic[-len(context) :], *of_actor[len(seen) : len(both)]):  # both losses reach the context
+        assert gradient.abs().max() > 0
+    torch.nn.utils.clip_grad_norm_([*heads, *both], STILL.max_grad_norm)
     torch.nn.utils.clip_grad_norm_(actors, STILL.max_grad_norm)
+    for mine, other in zip(ours.adapted_parameters(), theirs.adapted_parameters(), strict=True):
+        assert mine.grad is not None
+        assert other.grad is not None
+        difference = torch.linalg.vector_norm(mine.grad - other.grad)
+        assert difference <= 1e-4 * torch.linalg.vector_norm(other.grad)
     theirs.critic_optimizer.step()
     theirs.actor_optimizer.step()
     for mine, other in zip(ours.adapted_parameters(), theirs.adapted_parameters(), strict=True):

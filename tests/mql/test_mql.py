@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecMonitor
 
 from outlap.errors import OutlapError
 from outlap.mql.adaptation import AdaptationSettings, adapt, features
@@ -48,6 +49,17 @@ def mean_return(policy: Any, low: float, high: float) -> float:
 
 def weights(model: MQL) -> list[torch.Tensor]:
     return [parameter.detach().clone() for parameter in model.policy.parameters()]
+
+
+def test_tasks_are_told_through_wrappers() -> None:
+    model = toy(VecMonitor(HiddenGoal(16, -1.0, 1.0)), steps=64)
+    assert len(model.replay_buffer.tasks) > 1
+    assert all(str(task).startswith("goal ") for task in model.replay_buffer.tasks)
+
+
+def test_an_environment_that_shows_no_reward_is_named(meta: MQL) -> None:
+    with pytest.raises(OutlapError, match=r"is not shown 'observation'; put its environment into a ContextVecEnv"):
+        evaluate_policy(meta, HiddenGoal(4, -1.0, 1.0), n_eval_episodes=4, warn=False)
 
 
 def test_context_finds_a_goal_that_nothing_else_tells(meta: MQL) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -42,8 +43,12 @@ def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int,
 
 
 @pytest.mark.parametrize("length", [1, 4])
-@pytest.mark.parametrize("n", [19, 300])  # for one thread, and for two
-def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_too(length: int, n: int) -> None:
+@pytest.mark.parametrize(("n", "threads"), [(19, 1), (300, 2)])
+def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_too(
+    length: int, n: int, threads: int, request: pytest.FixtureRequest
+) -> None:
+    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+    torch.set_num_threads(threads)
     torch.manual_seed(1)
     hidden, rows = 21, 6  # no multiple of the lanes of a register
     projected = (4.0 * torch.randn(rows, n, 3 * hidden)).requires_grad_()

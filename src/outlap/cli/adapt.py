@@ -21,7 +21,6 @@ from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.cli.races import held_out_tracks, unused
 from outlap.cli.recordings import RECORDINGS, record_episodes, with_recordings
-from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -106,8 +105,9 @@ class Adapt:
             yield
         except BaseException as error:
             again = f"saved; go on with: {self._again(folder)}"
-            parts.close()
-            if not parts.has(0):
+            if parts.has(0):
+                parts.close()
+            else:
                 parts.remove()
                 shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
                 with suppress(OSError):
@@ -137,21 +137,16 @@ class Adapt:
         from outlap.evaluation.results import UPDATES, Parts, save_results, write_rows
         from outlap.evaluation.rollout import evaluate, standing_starts
         from outlap.mql.adaptation import AdaptationSettings, adapt
-        from outlap.mql.mql import MQL
         from outlap.mql.propensity import CLIP_RULES
+        from outlap.training.mql import load_meta
         from outlap.training.run import load_run, provenance
 
         for name in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
             check_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)
         check_least("--record", self.record, 0)
         run = load_run(self.run_folder)
-        if run.config.algorithm != "mql":
-            raise OutlapError(
-                f"{self.run_folder}: was trained with {run.config.algorithm}; must be one of outlap train mql"
-            )
+        meta = load_meta(run)
         tracks = load_tracks(self.tracks or held_out_tracks(run))
-        meta = MQL.load(run.policy_path, device=run.config.device)
-        meta.load_replay_buffer(run.replay_path)
         folder = self.out or unused(run.folder / "adaptations" / time.strftime("%Y%m%d-%H%M%S"))
         fingerprints = {track.name: track.fingerprint for track in tracks}
         races = standing_starts(run.config.env, tracks, 0, self.time_limit)
@@ -177,6 +172,7 @@ class Adapt:
                     policy, updates = meta, None
                     if method != BEFORE:
                         task = SB3VecEnv(self.collect_worlds, **{**dict(collecting), "tracks": [track]})
+                        task.env.training_steps = meta.num_timesteps  # curricula go on where training ended
                         task.seed(10_000 + seed)
                         policy, record = adapt(meta, task, replace(base, clip=CLIP_RULES[method]()), seed=seed)
                         updates = pd.DataFrame(record.updates).assign(method=method, seed=seed, track=track.name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from outlap.errors import OutlapError
 from outlap.files import atomic_write, make_folder, remove_partials, to_json
 
 ROWS, UPDATES, SUMMARY, RECORD = "episodes.parquet", "updates.parquet", "summary.json", "evaluation.json"
+LOCK = ".lock"
 
 
 def prepare_folder(folder: Path) -> None:
@@ -64,12 +64,10 @@ class Parts:
         """
         self.folder = folder / "parts"
         self._asked = self.folder / "asked.json"
-        if not self._asked.is_file():
-            with suppress(OSError):
-                shutil.rmtree(self.folder)  # of one that was killed in its first moment
+        if not self._asked.is_file() and not self._was_killed_at_once():
             prepare_folder(folder)
         make_folder(self.folder)
-        self._lock = FileLock(self.folder / ".lock")
+        self._lock = FileLock(self.folder / LOCK)
         try:
             self._lock.acquire(timeout=0)
         except Timeout:
@@ -115,11 +113,17 @@ class Parts:
     def remove(self) -> None:
         """Remove all parts, and close: the whole is written, or there is none."""
         self._asked.unlink(missing_ok=True)  # first: what is left after that is nobody's
-        self.close()
         shutil.rmtree(self.folder, ignore_errors=True)
+        self.close()
 
     def _path(self, number: int, name: str) -> Path:
         return self.folder / f"{number:06d}-{name}"
 
     def _all(self, name: str) -> pd.DataFrame:
         return pd.concat([pd.read_parquet(path) for path in sorted(self.folder.glob(f"*-{name}"))], ignore_index=True)
+
+    def _was_killed_at_once(self) -> bool:
+        """Whether there is only what a process leaves that had not noted yet what was asked."""
+        if not self.folder.is_dir() or list(self.folder.parent.iterdir()) != [self.folder]:
+            return False
+        return all(path.name == LOCK or ".partial" in path.name for path in self.folder.iterdir())

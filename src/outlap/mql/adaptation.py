@@ -124,6 +124,7 @@ def adapt(
                     "clipped_share": float((raw > level).mean()),
                     "effective_sample_size": ess,
                     "proximal_weight": pull,
+                    "classifier_accuracy": propensity.accuracy,
                     **numbers,
                 }
             )

@@ -61,8 +61,12 @@ TASK_KEYS = ("task", "track")  # of an `info`: the first that is there names the
 
 
 def task_of(info: Mapping[str, Any]) -> TaskName:
-    """The task that an info tells; None where it tells none."""
-    return next((info[key] for key in TASK_KEYS if key in info), None)
+    """The task that an info tells; None where it tells none. Raises OutlapError for one that cannot be saved."""
+    task = next((info[key] for key in TASK_KEYS if key in info), None)
+    task = task.item() if isinstance(task, np.generic) else task
+    if not isinstance(task, TaskName):
+        raise OutlapError(f"replay: a world's task is {task!r:.60}; must be a string, a whole number or None")
+    return task
 
 
 class HistoryBuffer:

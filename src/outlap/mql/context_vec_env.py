@@ -27,12 +27,12 @@ class ContextVecEnv(VecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         observation = self.venv.reset()
-        self.reset_infos = self.venv.reset_infos
+        self.reset_infos = self.venv.unwrapped.reset_infos  # wrappers between do not hand them on
         return self._shown(observation, np.zeros(self.num_envs, np.float32))
 
     def step_wait(self) -> VecEnvStepReturn:
         observation, rewards, dones, infos = self.venv.step_wait()
-        self.reset_infos = self.venv.reset_infos
+        self.reset_infos = self.venv.unwrapped.reset_infos
         for world in np.flatnonzero(dones):
             final = infos[world].get("terminal_observation")
             if final is not None:

@@ -145,6 +145,9 @@ class MQLPolicy(BasePolicy):
             episode_start: bool (n,): cars whose episode begins with this observation.
             deterministic: the policy has no other way to act.
         """
+        given = observation if isinstance(observation, dict) else {}
+        if missing := [name for name in self.window_terms if name not in given]:
+            raise OutlapError(f"MQLPolicy: is not shown {missing[0]!r}; put its environment into a ContextVecEnv")
         single = next(iter(observation.values())).ndim == 1
         if single:
             observation = {name: value[None] for name, value in observation.items()}
