@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
@@ -22,7 +23,7 @@ SHOW_CURSOR = "\x1b[?25h"
 
 @contextmanager
 def ctrl_c_spares_imports() -> Iterator[None]:
-    """Meanwhile, Ctrl-C raises KeyboardInterrupt, but never inside an import (see `is_importing`).
+    """Meanwhile, Ctrl-C raises KeyboardInterrupt, but never inside an import (see `is_importing`) or around a fork.
 
     An import that goes on for more than `IMPORT_PATIENCE` ends the process: what still imports has nothing to save.
     """
@@ -35,7 +36,7 @@ def ctrl_c_spares_imports() -> Iterator[None]:
 
     def heed(number: int, frame: FrameType | None) -> None:
         nonlocal first
-        if not is_importing(frame):
+        if not is_importing(frame) and not _is_at_fork(frame):
             first = None
             signal.default_int_handler(number, frame)
         if first is None:
@@ -54,6 +55,13 @@ def ctrl_c_spares_imports() -> Iterator[None]:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGALRM, alarm)
+
+
+def _is_at_fork(frame: FrameType | None) -> bool:
+    """Whether this is one of logging's functions around a fork, in which Python passes over every exception."""
+    if frame is None or frame.f_code.co_filename != logging.__file__:
+        return False
+    return frame.f_code.co_name in ("_acquireLock", "_releaseLock")
 
 
 def end_now(code: int) -> None:
