@@ -94,7 +94,7 @@ def test_what_is_drawn_are_the_rows_that_have_a_row_after_them() -> None:
 
 def test_windows_are_padded_before_an_episode_begins() -> None:
     windows = by_hand().windows(np.array([0, 2, 6, 8, 9, 14, 12]), 3, ["vel"])
-    assert windows.observation["vel"][:, :, 0].tolist() == [
+    assert windows.observation["vel"][:, :, 0].T.tolist() == [
         [0, 0, 10],
         [0, 10, 11],
         [11, 12, 13],
@@ -103,7 +103,7 @@ def test_windows_are_padded_before_an_episode_begins() -> None:
         [21, 22, 23],
         [53, 54, 55],
     ]
-    assert windows.valid.tolist() == [
+    assert windows.valid.T.tolist() == [
         [False, False, True],
         [False, True, True],
         [True, True, True],
@@ -111,18 +111,9 @@ def test_windows_are_padded_before_an_episode_begins() -> None:
         [False, True, True],
         [True, True, True],
         [True, True, True],
-    ]
-    assert windows.reward.tolist() == [
-        [0, 0, 0],
-        [0, 0, 1],
-        [1, 2, 4],
-        [0, 0, 0],
-        [0, 0, 8],
-        [8, 16, 32],
-        [100, 1000, 10000],
     ]
     np.testing.assert_allclose(
-        windows.action[:, :, 0],
+        windows.action[:, :, 0].T,
         [
             [0, 0, 0],
             [0, 0, 0.11],
@@ -140,8 +131,8 @@ def test_the_window_of_a_world_without_an_episode_is_empty() -> None:
     buffer = HistoryBuffer(100, VEL, 1, 2)
     begin(buffer, [1], [5], ["task"])
     windows = buffer.windows(buffer.latest, 2, ["vel"])
-    assert windows.valid.tolist() == [[False, False], [False, True]]
-    assert windows.observation["vel"][:, :, 0].tolist() == [[0, 0], [0, 5]]
+    assert windows.valid.T.tolist() == [[False, False], [False, True]]
+    assert windows.observation["vel"][:, :, 0].T.tolist() == [[0, 0], [0, 5]]
 
 
 def test_windows_hold_the_terms_that_are_asked_for() -> None:
@@ -149,15 +140,14 @@ def test_windows_hold_the_terms_that_are_asked_for() -> None:
     first = {"vel": np.ones((1, 1)), "heading": np.ones((1, 2)), "pose": np.ones((1, 3))}
     buffer.begin(np.array([0]), first, ["task"])
     windows = buffer.windows(np.array([0]), 4, ["pose", "vel"])
-    assert {name: values.shape for name, values in windows.observation.items()} == {"pose": (1, 4, 3), "vel": (1, 4, 1)}
+    assert {name: values.shape for name, values in windows.observation.items()} == {"pose": (4, 1, 3), "vel": (4, 1, 1)}
 
 
 def test_the_first_rows_of_windows() -> None:
     first = by_hand().windows(np.array([2, 14]), 3, ["vel"]).first(2)
-    assert first.observation["vel"][:, :, 0].tolist() == [[0, 10], [21, 22]]
-    assert first.valid.tolist() == [[False, True], [True, True]]
-    assert first.reward.tolist() == [[0, 0], [8, 16]]
-    np.testing.assert_allclose(first.action[:, :, 0], [[0, 0], [0.21, 0.22]], rtol=1e-6)
+    assert first.observation["vel"][:, :, 0].T.tolist() == [[0, 10], [21, 22]]
+    assert first.valid.T.tolist() == [[False, True], [True, True]]
+    np.testing.assert_allclose(first.action[:, :, 0].T, [[0, 0], [0.21, 0.22]], rtol=1e-6)
 
 
 def test_transitions_of_one_step() -> None:
@@ -171,7 +161,7 @@ def test_transitions_of_one_step() -> None:
     assert batch.observation["vel"][:, 0].tolist() == [10, 50, 12, 54, 22]
     assert batch.next_observation["vel"][:, 0].tolist() == [11, 51, 13, 55, 23]
     np.testing.assert_allclose(batch.action[:, 0], [0.11, 0.51, 0.13, 0.55, 0.23], rtol=1e-6)
-    assert batch.windows.observation["vel"][:, :, 0].tolist() == [
+    assert batch.windows.observation["vel"][:, :, 0].T.tolist() == [
         [0, 10, 11],
         [0, 50, 51],
         [11, 12, 13],
@@ -208,7 +198,7 @@ def test_transitions_of_three_steps_are_shorter_where_the_episode_ends() -> None
 
 def test_windows_of_three_steps_repeat_the_last_row_where_the_episode_ends() -> None:
     batch = by_hand().gather(np.array([0, 2, 4, 8, 9, 13]), history=3, n_steps=3, gamma=0.5, terms=["vel"])
-    assert batch.windows.observation["vel"][:, :, 0].tolist() == [
+    assert batch.windows.observation["vel"][:, :, 0].T.tolist() == [
         [0, 0, 10, 11, 12, 13],
         [0, 10, 11, 12, 13, 13],
         [10, 11, 12, 13, 13, 13],
@@ -216,8 +206,8 @@ def test_windows_of_three_steps_repeat_the_last_row_where_the_episode_ends() -> 
         [0, 20, 21, 22, 23, 23],
         [0, 0, 60, 61, 61, 61],
     ]
-    assert batch.windows.valid.sum(1).tolist() == [4, 5, 6, 4, 5, 4]
-    assert batch.windows.valid[:, 2:].all()
+    assert batch.windows.valid.sum(0).tolist() == [4, 5, 6, 4, 5, 4]
+    assert batch.windows.valid[2:].all()
 
 
 @pytest.mark.parametrize("n_steps", [1, 2, 3, 5])
@@ -225,17 +215,16 @@ def test_a_window_holds_the_departure_and_the_arrival_where_it_says(n_steps: int
     buffer, history = by_hand(), 3
     batch = buffer.gather(np.array(DEPARTURES), history=history, n_steps=n_steps, gamma=0.5, terms=["vel"])
     held, each = batch.windows.observation["vel"], np.arange(len(DEPARTURES))
-    assert held.shape == (len(DEPARTURES), history + n_steps, 1)
+    assert held.shape == (history + n_steps, len(DEPARTURES), 1)
     expected = [10, 50, 11, 51, 12, 52, 53, 20, 21, 54, 22, 60]
-    assert held[:, history - 1, 0].tolist() == expected == batch.observation["vel"][:, 0].tolist()
-    np.testing.assert_array_equal(held[each, history - 1 + batch.steps], batch.next_observation["vel"])
+    assert held[history - 1, :, 0].tolist() == expected == batch.observation["vel"][:, 0].tolist()
+    np.testing.assert_array_equal(held[history - 1 + batch.steps, each], batch.next_observation["vel"])
     # The window that ends at the arrival is that of the arrival itself.
     arrivals = [serial_of(buffer, value) for value in batch.next_observation["vel"][:, 0]]
     ends = buffer.windows(np.array(arrivals), history, ["vel"])
-    cut = batch.steps[:, None] + np.arange(history)
-    np.testing.assert_array_equal(held[each[:, None], cut], ends.observation["vel"])
-    np.testing.assert_array_equal(batch.windows.valid[each[:, None], cut], ends.valid)
-    np.testing.assert_array_equal(batch.windows.reward[each[:, None], cut], ends.reward)
+    cut = batch.steps + np.arange(history)[:, None]
+    np.testing.assert_array_equal(held[cut, each], ends.observation["vel"])
+    np.testing.assert_array_equal(batch.windows.valid[cut, each], ends.valid)
 
 
 def serial_of(buffer: HistoryBuffer, value: float) -> int:
@@ -258,8 +247,8 @@ def test_a_window_ends_where_older_rows_are_gone() -> None:
     assert (buffer.oldest, buffer.transitions()) == (8, 5)
     assert np.unique(buffer.sample(500, np.random.default_rng(0))).tolist() == [8, 9, 10, 11, 13]
     windows = buffer.windows(np.array([10, 12]), 3, ["vel"])  # 53 was serial 7
-    assert windows.observation["vel"][:, :, 0].tolist() == [[0, 0, 54], [0, 54, 55]]
-    assert windows.valid.tolist() == [[False, False, True], [False, True, True]]
+    assert windows.observation["vel"][:, :, 0].T.tolist() == [[0, 0, 54], [0, 54, 55]]
+    assert windows.valid.T.tolist() == [[False, False, True], [False, True, True]]
 
 
 # Against plain lists.
@@ -348,14 +337,13 @@ class Stream:
 def check_windows(windows: Windows, expected: list[list[Row]], length: int) -> None:
     for i, rows in enumerate(expected):
         padding = length - len(rows)
-        assert windows.valid[i, :length].tolist() == [False] * padding + [True] * len(rows)
+        assert windows.valid[:length, i].tolist() == [False] * padding + [True] * len(rows)
         values = [0.0] * padding + [row.value for row in rows]
-        assert windows.observation["vel"][i, :length, 0].tolist() == values
+        assert windows.observation["vel"][:length, i, 0].tolist() == values
         scan = [[0.0] * 3] * padding + [[row.serial % 2000] * 3 for row in rows]
-        assert windows.observation["scan"][i, :length].tolist() == scan
-        assert windows.reward[i, :length].tolist() == [0.0] * padding + [row.reward for row in rows]
-        np.testing.assert_array_equal(windows.action[i, :padding], 0.0)
-        np.testing.assert_array_equal(windows.action[i, padding:length], [row.action for row in rows])
+        assert windows.observation["scan"][:length, i].tolist() == scan
+        np.testing.assert_array_equal(windows.action[:padding, i], 0.0)
+        np.testing.assert_array_equal(windows.action[padding:length, i], [row.action for row in rows])
 
 
 def check_batch(batch: Batch, lists: Lists, buffer: HistoryBuffer, history: int, n_steps: int, gamma: float) -> None:
@@ -372,9 +360,8 @@ def check_batch(batch: Batch, lists: Lists, buffer: HistoryBuffer, history: int,
         assert batch.discount[i] == pytest.approx(0.0 if path[-1].terminated else gamma ** len(path))
         np.testing.assert_array_equal(batch.action[i], path[0].action)
         repeated = path + [path[-1]] * (n_steps - len(path))
-        assert batch.windows.observation["vel"][i, history:, 0].tolist() == [step.value for step in repeated]
-        assert batch.windows.reward[i, history:].tolist() == [step.reward for step in repeated]
-        assert batch.windows.valid[i, history:].all()
+        assert batch.windows.observation["vel"][history:, i, 0].tolist() == [step.value for step in repeated]
+        assert batch.windows.valid[history:, i].all()
         assert (batch.observation["vel"][i, 0], batch.next_observation["vel"][i, 0]) == (row.value, path[-1].value)
         assert batch.observation["scan"][i].tolist() == [serial % 2000] * 3
         assert batch.next_observation["scan"][i].tolist() == [path[-1].serial % 2000] * 3
@@ -455,11 +442,11 @@ def test_a_row_whose_row_before_is_gone_is_linked_to_no_other() -> None:
         add(buffer, [0], [value], [1])
     add(buffer, [1], [99], [1])  # serial 10; that of its row before was 1, where 9 is now
     batch = buffer.gather(np.array([8]), history=1, n_steps=2, gamma=0.5, terms=["vel"])
-    assert batch.windows.observation["vel"][0, :, 0].tolist() == [8, 9, 9]
+    assert batch.windows.observation["vel"][:, 0, 0].tolist() == [8, 9, 9]
     assert (batch.steps[0], batch.reward[0]) == (1, 1)
     windows = buffer.windows(np.array([10]), 2, ["vel"])
-    assert windows.observation["vel"][0, :, 0].tolist() == [0, 99]
-    assert windows.valid[0].tolist() == [False, True]
+    assert windows.observation["vel"][:, 0, 0].tolist() == [0, 99]
+    assert windows.valid[:, 0].tolist() == [False, True]
 
 
 # Which tasks are drawn.
@@ -580,7 +567,7 @@ def test_a_saved_buffer_goes_on_as_if_nothing_had_been(capacity: int, share: flo
 def same_batch(one: Batch, other: Batch) -> None:
     for name in ("serial", "task", "action", "reward", "discount", "steps"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    for name in ("action", "reward", "valid"):
+    for name in ("action", "valid"):
         np.testing.assert_array_equal(getattr(one.windows, name), getattr(other.windows, name))
     for ours, theirs in (
         (one.observation, other.observation),
@@ -719,13 +706,12 @@ def test_scans_are_stored_in_half_precision_to_8_mm_and_the_rest_in_single() -> 
     assert buffer.observation["scan"].dtype == np.float16
     assert buffer.observation["vel"].dtype == np.float32
     windows = buffer.windows(np.array([1]), 2, ["scan", "vel"])
-    assert windows.observation["scan"].dtype == np.float16
-    assert windows.observation["vel"].dtype == np.float32
+    assert windows.steps.dtype == np.float32
     for term, expected in enumerate((scan[0], scan[0] / 2)):
-        error = np.abs(windows.observation["scan"][0, term].astype(np.float64) - expected)
+        error = np.abs(windows.observation["scan"][term, 0].astype(np.float64) - expected)
         assert error.max() <= 2.0**-7  # half of the spacing from 16 m to 32 m
         assert (error <= expected * 2.0**-11 + 1e-12).all()
-    np.testing.assert_array_equal(windows.observation["vel"][0], np.stack([velocity[0], velocity[0] / 3]))
+    np.testing.assert_array_equal(windows.observation["vel"][:, 0], np.stack([velocity[0], velocity[0] / 3]))
 
 
 def test_other_terms_may_be_stored_in_half_precision() -> None:
@@ -739,11 +725,10 @@ def test_what_is_read_is_a_copy() -> None:
     windows = buffer.windows(np.array([4]), 2, ["vel"])
     for values in (*batch.observation.values(), *batch.next_observation.values(), *windows.observation.values()):
         values[...] = 99.0
-    windows.action[...] = windows.reward[...] = batch.action[...] = 99.0
+    windows.action[...] = batch.action[...] = 99.0
     after = buffer.windows(np.array([4, 6]), 2, ["vel"])
-    assert after.observation["vel"][:, :, 0].tolist() == [[11, 12], [12, 13]]
-    assert after.reward.tolist() == [[1, 2], [2, 4]]
-    np.testing.assert_allclose(after.action[:, :, 0], [[0.11, 0.12], [0.12, 0.13]], rtol=1e-6)
+    assert after.observation["vel"][:, :, 0].T.tolist() == [[11, 12], [12, 13]]
+    np.testing.assert_allclose(after.action[:, :, 0].T, [[0.11, 0.12], [0.12, 0.13]], rtol=1e-6)
 
 
 # Mistakes.
@@ -815,8 +800,8 @@ def test_a_step_that_ends_episodes_stores_where_they_ended_and_begins_the_next()
 
     assert buffer.added == 11  # three rows more, of the episodes that begin
     newest = buffer.windows(buffer.latest, 2, ["vel"])
-    assert newest.observation["vel"][:, :, 0].tolist() == [[0, 100], [0, 200], [3, 30], [0, 400]]
-    assert newest.reward.tolist() == [[0, 0], [0, 0], [0, 3], [0, 0]]
+    assert newest.observation["vel"][:, :, 0].T.tolist() == [[0, 100], [0, 200], [3, 30], [0, 400]]
+    assert buffer.reward[buffer.latest].tolist() == [0, 0, 3, 0]
 
     quiet = fake_env(*[{"track": "not begun"}] * 4)
     buffer.add_step(quiet, vel(101, 201, 31, 401), action, reward, np.zeros(4, bool), [{}] * 4)

@@ -58,7 +58,7 @@ def test_tasks_are_told_through_wrappers() -> None:
 
 
 def test_an_environment_that_shows_no_reward_is_named(meta: MQL) -> None:
-    with pytest.raises(OutlapError, match=r"is not shown 'observation'; put its environment into a ContextVecEnv"):
+    with pytest.raises(OutlapError, match=r"is not shown 'previous_reward'; put its environment into a ContextVecEnv"):
         evaluate_policy(meta, HiddenGoal(4, -1.0, 1.0), n_eval_episodes=4, warn=False)
 
 

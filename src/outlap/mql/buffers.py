@@ -18,27 +18,38 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numba import njit
 from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.errors import OutlapError, brief
 from outlap.files import replacing
+from outlap.mql.gather import gather_rows
 
 NONE = -1  # serial of no row
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Sequences of rows, oldest first; (n, length, ...)."""
+    """Sequences of rows, oldest first, as a network goes through them: step by step."""
 
-    observation: dict[str, np.ndarray]  # (n, length, size) of each term asked for, as stored
-    action: np.ndarray  # float32 (n, length, actions) that led to each row; 0 at an episode's start
-    reward: np.ndarray  # float32 (n, length) that came with it
-    valid: np.ndarray  # bool (n, length): False before an episode's start, where all else is 0
+    steps: np.ndarray  # float32 (length, n, columns): the action that led to each row, then each term asked for
+    columns: dict[str, slice]  # of each term in `steps`
+    valid: np.ndarray  # bool (length, n): False before an episode's start, where all else is 0
+
+    @property
+    def action(self) -> np.ndarray:
+        """(length, n, actions) that led to each row; 0 at an episode's start."""
+        ends = min((columns.start for columns in self.columns.values()), default=None)
+        return self.steps[..., :ends]
+
+    @property
+    def observation(self) -> dict[str, np.ndarray]:
+        """(length, n, size) of each term."""
+        return {name: self.steps[..., columns] for name, columns in self.columns.items()}
 
     def first(self, rows: int) -> Windows:
         """The first `rows` rows of each."""
-        observation = {name: values[:, :rows] for name, values in self.observation.items()}
-        return Windows(observation, self.action[:, :rows], self.reward[:, :rows], self.valid[:, :rows])
+        return Windows(self.steps[:rows], self.columns, self.valid[:rows])
 
 
 @dataclass(frozen=True)
@@ -47,8 +58,8 @@ class Batch:
 
     serial: np.ndarray  # int64 (n,) of the rows that they depart from
     task: np.ndarray  # int64 (n,) positions in `HistoryBuffer.tasks`
-    windows: Windows  # (n, history + n_steps): up to the departure, then onwards; the last row repeated at the end
-    observation: dict[str, np.ndarray]  # (n, size) of every term, at the departure
+    windows: Windows  # of history + n_steps rows: up to the departure, then onwards; the last row repeated at the end
+    observation: dict[str, np.ndarray]  # float32 (n, size) of every term, at the departure
     next_observation: dict[str, np.ndarray]  # (n, size) at the arrival
     action: np.ndarray  # float32 (n, actions) taken at the departure
     reward: np.ndarray  # float32 (n,) discounted sum over the steps
@@ -242,7 +253,8 @@ class HistoryBuffer:
             length: rows of a window.
             terms: of the observation that are wanted.
         """
-        return self._read(self._walk_back(serial, length), terms)
+        rows, _, _ = self._trace(serial, length, 0, 1.0)
+        return self._read(rows, terms)
 
     def gather(
         self, serial: np.ndarray, *, history: int, n_steps: int = 1, gamma: float = 0.99, terms: Sequence[str] = ()
@@ -257,61 +269,33 @@ class HistoryBuffer:
             terms: of the observation that the windows hold.
         """
         n = len(serial)
-        path = np.full((n, history + n_steps), NONE)
-        path[:, :history] = self._walk_back(serial, history)
-        steps = np.zeros(n, np.int64)
-        reward = np.zeros(n)
-        here = np.asarray(serial)
-        for column in range(history, history + n_steps):
-            after = self.after[here % self.capacity]
-            goes_on = after != NONE
-            here = np.where(goes_on, after, here)
-            path[:, column] = here
-            reward += np.where(goes_on, gamma ** (column - history) * self.reward[here % self.capacity], 0.0)
-            steps += goes_on
-        first, last = np.asarray(serial) % self.capacity, here % self.capacity
-        windows = self._read(path, terms)
-        each = np.arange(n)
-        arrival = history - 1 + steps
+        rows, steps, reward = self._trace(serial, history, n_steps, gamma)
+        first, last = rows[history - 1], rows[-1]
+        ends, columns = gather_rows(self.observation, np.concatenate([first, last]))
         return Batch(
             serial=np.asarray(serial),
             task=self.task[first],
-            windows=windows,
-            observation={
-                name: windows.observation[name][:, history - 1] if name in terms else _floats(column[first])
-                for name, column in self.observation.items()
-            },
-            next_observation={
-                name: windows.observation[name][each, arrival] if name in terms else _floats(column[last])
-                for name, column in self.observation.items()
-            },
-            action=windows.action[:, history],
-            reward=reward.astype(np.float32),
+            windows=self._read(rows, terms),
+            observation={name: ends[:n, place] for name, place in columns.items()},
+            next_observation={name: ends[n:, place] for name, place in columns.items()},
+            action=self.action[rows[history]],
+            reward=reward,
             discount=np.where(self.terminated[last], 0.0, gamma**steps).astype(np.float32),
             steps=steps,
         )
 
-    def _walk_back(self, serial: np.ndarray, length: int) -> np.ndarray:
-        """Serials (n, length) of the rows that lead to some rows; NONE before the episode or the ring began."""
-        path = np.full((len(serial), length), NONE)
-        here = np.asarray(serial)
-        for column in reversed(range(length)):
-            path[:, column] = here
-            before = np.where(here == NONE, NONE, self.before[here % self.capacity])
-            here = np.where(before >= self.oldest, before, NONE)
-        return path
+    def _trace(
+        self, serial: np.ndarray, history: int, n_steps: int, gamma: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `_trace`; NONE before the episode or the ring began."""
+        given = np.asarray(serial, np.int64), self.before, self.after, self.reward
+        return _trace(*given, self.oldest, history, n_steps, gamma)
 
-    def _read(self, path: np.ndarray, terms: Sequence[str]) -> Windows:
-        by_step = path.T  # as a network goes through them, so that none of it need be copied for that
-        rows, missing = by_step % self.capacity, by_step == NONE
-
-        def read(column: np.ndarray) -> np.ndarray:
-            values = column.take(rows, axis=0)
-            values[missing] = 0.0
-            return values.swapaxes(0, 1)
-
-        observation = {name: read(self.observation[name]) for name in terms}
-        return Windows(observation, read(self.action), read(self.reward), ~missing.T)
+    def _read(self, rows: np.ndarray, terms: Sequence[str]) -> Windows:
+        sources = {"": self.action, **{name: self.observation[name] for name in terms}}
+        steps, columns = gather_rows(sources, rows.ravel())
+        columns.pop("")
+        return Windows(steps.reshape(*rows.shape, -1), columns, rows != NONE)
 
     def _add(self, worlds, observation, action, reward, terminated, before, tasks) -> None:
         serial = self.added + np.arange(len(worlds))
@@ -417,14 +401,12 @@ class _Recent:
         return self.ring[: min(self.added, len(self.ring))]
 
     def _first(self, oldest: int) -> int:
-        low, high = max(0, self.added - len(self.ring)), self.added
-        while low < high:  # by halves, over the ring as it was filled
-            middle = (low + high) // 2
-            if self.ring[middle % len(self.ring)] < oldest:
-                low = middle + 1
-            else:
-                high = middle
-        return low
+        held, turned = self._held(), max(0, self.added - len(self.ring))
+        start = turned % len(self.ring) if turned else 0  # of the ring as it was filled
+        newer = np.searchsorted(held[start:], oldest)
+        if newer == len(held) - start:
+            newer += np.searchsorted(held[:start], oldest)
+        return turned + int(newer)
 
 
 def _grown(rows: np.ndarray, capacity: int) -> np.ndarray:
@@ -433,5 +415,33 @@ def _grown(rows: np.ndarray, capacity: int) -> np.ndarray:
     return grown
 
 
-def _floats(values: np.ndarray) -> np.ndarray:
-    return values.astype(np.float32, copy=False)
+@njit(cache=True)
+def _trace(serial, before, after, reward, oldest, history, n_steps, gamma):
+    """Where the rows of transitions lie that depart from some rows.
+
+    Returns:
+        Positions int64 (history + n_steps, n) of the rows that lead to the departure and on, NONE before the episode
+        or the ring began, the last one repeated behind the episode's end; int64 (n,) steps that there are, up to
+        n_steps; float32 (n,) the discounted sum of their rewards.
+    """
+    n, capacity = len(serial), len(before)
+    rows = np.full((history + n_steps, n), NONE)
+    steps, returns = np.zeros(n, np.int64), np.zeros(n)
+    # Step by step, and not transition by transition: so the waits for memory overlap.
+    here = serial.copy()
+    for t in range(history - 1, -1, -1):
+        for i in range(n):
+            if here[i] != NONE:
+                rows[t, i] = here[i] % capacity
+                there = before[rows[t, i]]
+                here[i] = there if there >= oldest else NONE
+    here[:] = serial
+    for t in range(n_steps):
+        for i in range(n):
+            there = after[here[i] % capacity]
+            if there != NONE:
+                here[i] = there
+                steps[i] += 1
+                returns[i] += gamma**t * reward[there % capacity]
+            rows[history + t, i] = here[i] % capacity
+    return rows, steps, returns.astype(np.float32)

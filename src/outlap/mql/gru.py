@@ -1,7 +1,7 @@
 """A GRU layer over windows, with its gradient written out.
 
-The matrix products are PyTorch's; all that stands between two of them is one pass over the data, in Numba. As
-separate tensor operations those passes would take longer than the products.
+On a CPU a thread takes some windows through all their steps, so that what it works on stays in its cache: one kernel
+forwards, one back. The two large products of the gradient are PyTorch's.
 """
 
 from __future__ import annotations
@@ -14,10 +14,13 @@ from numba import cfunc, njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from outlap.mql.torch_threads import BLOCK, ROW_LOOP, RowLoop, bfloats, floats, integers, load, store, take
+from outlap.mql.lanes import LANES, ROWS, clip, load, product, splat, store
+from outlap.mql.torch_threads import BLOCK, ROW_LOOP, blocks_of, floats, integers, row_loop, take
 
 
-def gru(projected: Tensor, valid: Tensor, first: Tensor, length: int, weight: Tensor, bias: Tensor) -> Tensor:
+def gru(
+    projected: Tensor, valid: Tensor, first: Tensor, length: int, input_bias: Tensor, weight: Tensor, bias: Tensor
+) -> Tensor:
     """The hidden state after every step of each window, from 0: (length, n, hidden).
 
     r, u = σ(x + W h + b)  ·  c = tanh(x + r (W h + b))  ·  h' = c + u (h - c)
@@ -25,49 +28,50 @@ def gru(projected: Tensor, valid: Tensor, first: Tensor, length: int, weight: Te
     Cho et al. (2014), with the reset gate behind the recurrent product as in cuDNN and `torch.nn.GRU`.
 
     Args:
-        projected: (rows, n, 3 hidden) the inputs' share x of r, u and c. In bfloat16 on a CPU, the products are made
-            of factors rounded to that and are rounded so, and the states stay float32.
+        projected: (rows, n, 3 hidden) and
+        input_bias: (3 hidden,), together the inputs' share x of r, u and c.
         valid: (rows, n), 0 where the state is held at 0.
         first: int64 (n,) the row where each window begins.
         length: rows of a window.
-        weight: (3 hidden, hidden) and
-        bias: (3 hidden,) of the recurrent product.
+        weight: (3 hidden, hidden) W and
+        bias: (3 hidden,) b of the recurrent product.
 
     Raises ValueError where shapes do not fit, or a window leaves the rows.
     """
     rows, n, width = projected.shape
-    fit = width == len(weight) == len(bias) == 3 * weight.shape[1] and valid.shape == (rows, n) and first.shape == (n,)
+    fit = width == len(weight) == len(bias) == len(input_bias) == 3 * weight.shape[1] and valid.shape == (rows, n)
+    fit = fit and first.shape == (n,)
     on_cpu = projected.device.type == "cpu"  # elsewhere PyTorch looks at the range itself
     if not fit or (on_cpu and not ((first >= 0) & (first + length <= rows)).all()):
         raise ValueError(f"windows of {length} rows do not fit {tuple(projected.shape)}, or weights or masks do not")
-    if on_cpu and projected.dtype in _STEPS:
-        given = projected.contiguous(), valid.float().contiguous(), first.long().contiguous(), length, weight
-        states = GRULayer.apply(*given, bias.float().contiguous(), torch.is_grad_enabled())
+    if on_cpu and projected.dtype == weight.dtype == torch.float32 and weight.shape[1] % (2 * LANES) == 0:
+        given = projected.contiguous(), valid.float().contiguous(), first.long().contiguous(), length
+        states = GRULayer.apply(*given, input_bias, weight, bias, torch.is_grad_enabled())
         assert isinstance(states, Tensor)
-        return states.to(weight.dtype)
-    return _gru_of_operations(projected, valid, first, length, weight, bias)
+        return states
+    return _gru_of_operations(projected, valid, first, length, input_bias, weight, bias)
 
 
 def _gru_of_operations(
-    projected: Tensor, valid: Tensor, first: Tensor, length: int, weight: Tensor, bias: Tensor
+    projected: Tensor, valid: Tensor, first: Tensor, length: int, input_bias: Tensor, weight: Tensor, bias: Tensor
 ) -> Tensor:
-    """`gru` of PyTorch's operations alone, for other devices and types of number."""
+    """`gru` of PyTorch's operations alone: for other devices, types of number and sizes."""
     hidden, each = weight.shape[1], torch.arange(projected.shape[1], device=projected.device)
     state = projected.new_zeros(projected.shape[1], hidden)
     states = []
     for t in range(length):
-        x = projected[first + t, each]
-        product = torch.addmm(bias, state, weight.t())
-        gates = torch.sigmoid(x[:, : 2 * hidden] + product[:, : 2 * hidden])
+        x = projected[first + t, each] + input_bias
+        of_state = torch.addmm(bias, state, weight.t())
+        gates = torch.sigmoid(x[:, : 2 * hidden] + of_state[:, : 2 * hidden])
         reset, update = gates.chunk(2, -1)
-        candidate = torch.tanh(x[:, 2 * hidden :] + reset * product[:, 2 * hidden :])
+        candidate = torch.tanh(x[:, 2 * hidden :] + reset * of_state[:, 2 * hidden :])
         state = valid[first + t, each].unsqueeze(-1) * torch.lerp(candidate, state, update)
         states.append(state)
     return torch.stack(states)
 
 
 class GRULayer(torch.autograd.Function):
-    """`gru` on a CPU, for `projected` in float32 or bfloat16."""
+    """`gru` on a CPU, in float32, for hidden states that fill registers."""
 
     @staticmethod
     def forward(
@@ -76,6 +80,7 @@ class GRULayer(torch.autograd.Function):
         valid: Tensor,
         first: Tensor,
         length: int,
+        input_bias: Tensor,
         weight: Tensor,
         bias: Tensor,
         with_grad: bool,
@@ -85,31 +90,22 @@ class GRULayer(torch.autograd.Function):
         kept = length if with_grad else 1
         gates = valid.new_empty(kept, n, 3 * hidden)  # r, u and the recurrent product's share of c
         candidates = valid.new_empty(kept, n, hidden)
-        states = valid.new_zeros(length + 1, n, hidden)
-        rounds = projected.dtype != states.dtype
-        factors = states.to(projected.dtype) if rounds else states  # of products
-        weight = weight.to(projected.dtype)
-        transposed = weight.t()
-        product = projected.new_empty(n, 3 * hidden) if rounds else gates  # in place where nothing is rounded
-        step = RowLoop(
-            _STEPS[projected.dtype], n, hidden, kept, valid, first, states, gates, candidates, bias,
-            projected, product, factors,
+        states = valid.new_empty(length + 1, n, hidden)
+        states[0] = 0.0
+        both = torch.cat([input_bias[: 2 * hidden] + bias[: 2 * hidden], input_bias[2 * hidden :], bias[2 * hidden :]])
+        # Columns of r, u and c that one step of the kernel's product makes, side by side.
+        packed = weight.view(3, -1, LANES, hidden).permute(1, 3, 0, 2).contiguous()
+        row_loop(
+            _forwards, n, hidden, length, kept, valid, first, projected, both, packed, gates, candidates, states
         )  # fmt: skip
-        for t in range(length):
-            here = product if rounds else gates[t % kept]
-            if t:
-                torch.mm(factors[t], transposed, out=here)
-            else:
-                here.zero_()  # as the state is
-            step(t)
         if with_grad:
-            ctx.save_for_backward(projected, valid, first, gates, candidates, states, factors, weight)
+            ctx.save_for_backward(projected, valid, first, gates, candidates, states, weight)
         return states[1:]
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor):
-        projected, valid, first, gates, candidates, states, factors, weight = ctx.saved_tensors
+        projected, valid, first, gates, candidates, states, weight = ctx.saved_tensors
         arrived = grads[0].contiguous()
         length, n, hidden = arrived.shape
         grad = torch.empty_like(projected)
@@ -117,142 +113,147 @@ class GRULayer(torch.autograd.Function):
         for outside in (grad[:spare], grad[length:]):
             outside.zero_()
         recurrent = grad.new_empty(length, n, 3 * hidden)  # the gradient of the recurrent products
-        back = torch.zeros_like(arrived[0])
-        rounds = projected.dtype != back.dtype
-        product = grad.new_zeros(n, hidden) if rounds else back
-        own = torch.empty_like(gates[0]) if rounds else grad
-        step_back = RowLoop(
-            _STEPS_BACK[projected.dtype], n, hidden, valid, first, gates, candidates, states, arrived, back,
-            product, grad, recurrent, own,
+        back = grad.new_zeros(n, hidden)  # what arrives from the step behind
+        of_biases = grad.new_zeros(blocks_of(n), 4 * hidden)
+        packed = weight.view(3 * hidden, -1, 2 * LANES).transpose(0, 1).contiguous()
+        row_loop(
+            _backwards, n, hidden, length, valid, first, gates, candidates, states, packed, arrived, back, grad,
+            recurrent, of_biases,
         )  # fmt: skip
-        for t in reversed(range(length)):
-            step_back(t)
-            if t and rounds:
-                torch.mm(recurrent[t], weight, out=product)
-            elif t:
-                back.addmm_(recurrent[t], weight)
-        of_weight = recurrent[1:].view(-1, 3 * hidden).t() @ factors[1:-1].view(-1, hidden)
-        of_bias = recurrent.sum((0, 1), dtype=arrived.dtype)
-        return grad, None, None, None, of_weight.to(arrived.dtype), of_bias, None
+        of_weight = recurrent[1:].view(-1, 3 * hidden).t() @ states[1:-1].view(-1, hidden)
+        of_both, of_input, of_recurrent = of_biases.sum(0).split([2 * hidden, hidden, hidden])
+        of_input, of_recurrent = torch.cat([of_both, of_input]), torch.cat([of_both, of_recurrent])
+        return grad, None, None, None, of_input, of_weight, of_recurrent, None
 
 
 _f4, _u8 = np.float32, np.uint64
-_2, _3 = _u8(2), _u8(3)
-_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+_0, _1, _2, _3, _4 = _u8(0), _u8(1), _u8(2), _u8(3), _u8(4)
+_lanes, _rows = _u8(LANES), _u8(ROWS)
+_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy"}
+
+_gates_of_rows, _gates_of_row = (product(rows, 3, adds=False) for rows in (ROWS, 1))
+_back_of_rows, _back_of_row = (product(rows, 2, adds=True) for rows in (ROWS, 1))
 
 
 @njit(**_OPTIONS)
 def _tanh(x):
     """Lambert's continued fraction to its seventh term at x / 2, and tanh 2y = 2 tanh y / (1 + tanh² y): to 1e-7.
 
-    Only products and one quotient, so that the lanes of a register compute 16 at a time; the library's tanh does not.
+    Only products and one quotient, of all lanes at once; the library's tanh takes them one by one.
     """
-    y = _f4(0.5) * x
-    y = _f4(-5) if y < _f4(-5) else y  # in this order nan stays nan
-    y = _f4(5) if y > _f4(5) else y
+    y = clip(splat(_f4(0.5)) * x, splat(_f4(-5)), splat(_f4(5)))
     s = y * y
-    a = y * (_f4(135135) + s * (_f4(17325) + s * (_f4(378) + s)))
-    b = _f4(135135) + s * (_f4(62370) + s * (_f4(3150) + _f4(28) * s))
-    return _f4(2) * a * b / (a * a + b * b)
-
-
-# Loops are vectorised because arrays are flat, few to a loop, and all whole numbers unsigned.
+    a = y * (splat(_f4(135135)) + s * (splat(_f4(17325)) + s * (splat(_f4(378)) + s)))
+    b = splat(_f4(135135)) + s * (splat(_f4(62370)) + s * (splat(_f4(3150)) + splat(_f4(28)) * s))
+    return splat(_f4(2)) * a * b / (a * a + b * b)
 
 
 @njit(**_OPTIONS)
-def _step(given, projected, product, factors):
-    """Everything of a step behind its product; `factors` are the states as the next product reads them.
+def _sigmoid(x):
+    half = splat(_f4(0.5))
+    return half + half * _tanh(half * x)
 
-    Where nothing is rounded, both are none: the product is in `gates`, and the states are read as they are.
-    """
-    n, t, hidden, kept = given[1], given[2], given[3], given[4]
-    valid, first, states = floats(given[5]), integers(given[6]), floats(given[7])
-    gates, candidates, bias = floats(given[8]), floats(given[9]), floats(given[10])
+
+@cfunc(ROW_LOOP, **_OPTIONS)
+def _forwards(given):
+    n, hidden, length, kept = given[1], given[2], given[3], given[4]
+    valid, first, projected = floats(given[5]), integers(given[6]), floats(given[7])
+    bias, weight = floats(given[8]), floats(given[9])
+    gates, candidates, states = floats(given[10]), floats(given[11]), floats(given[12])
+    width = _3 * hidden
     begin = take(given)
     while begin < n:
-        for i in range(begin, min(begin + _u8(BLOCK), n)):
-            row, here, at = n * (_u8(first[i]) + t) + i, n * t + i, n * (t % kept) + i
-            x, m, h, keep = _3 * hidden * row, _3 * hidden * i, hidden * here, valid[row]
-            g, c, after = _3 * hidden * at, hidden * at, h + n * hidden
-            if product is not None:
-                for j in range(_3 * hidden):
-                    gates[g + j] = load(product, m + j)
-            for j in range(_3 * hidden):
-                gates[g + j] += bias[j]
-            for j in range(_2 * hidden):
-                gates[g + j] = _f4(0.5) + _f4(0.5) * _tanh(_f4(0.5) * (load(projected, x + j) + gates[g + j]))
-            u, p, x = g + hidden, g + _2 * hidden, x + _2 * hidden
-            for j in range(hidden):
-                candidates[c + j] = _tanh(load(projected, x + j) + gates[g + j] * gates[p + j])
-            for j in range(hidden):
-                states[after + j] = gates[u + j] * (states[h + j] - candidates[c + j])
-            for j in range(hidden):
-                states[after + j] = keep * (candidates[c + j] + states[after + j])
-            if factors is not None:
-                for j in range(hidden):
-                    store(factors, after + j, states[after + j])
+        end = min(begin + _u8(BLOCK), n)
+        for step in range(length):
+            t = _u8(step)
+            at = n * (t % kept)
+            if t == _0:  # the state is 0
+                for k in range(width * (at + begin), width * (at + end), _lanes):
+                    store(gates, k, splat(_f4(0)))
+            else:
+                j = _0
+                while j < hidden:
+                    i = begin
+                    while i < end:
+                        h, g = hidden * (n * t + i), width * (at + i) + j
+                        if i + _rows <= end:
+                            _gates_of_rows(states, h, hidden, weight, width * j, hidden, gates, g, width, hidden)
+                            i += _rows
+                        else:
+                            _gates_of_row(states, h, hidden, weight, width * j, hidden, gates, g, width, hidden)
+                            i += _1
+                    j += _lanes
+            for i in range(begin, end):
+                row = n * (_u8(first[i]) + t) + i
+                keep = splat(valid[row])
+                j = _0
+                while j < hidden:
+                    x, g, h = width * row + j, width * (at + i) + j, hidden * (n * t + i) + j
+                    reset = _sigmoid(load(projected, x) + load(gates, g) + load(bias, j))
+                    update = _sigmoid(load(projected, x + hidden) + load(gates, g + hidden) + load(bias, hidden + j))
+                    share = load(gates, g + _2 * hidden) + load(bias, width + j)
+                    of_input = load(projected, x + _2 * hidden) + load(bias, _2 * hidden + j)
+                    candidate = _tanh(of_input + reset * share)
+                    store(gates, g, reset)
+                    store(gates, g + hidden, update)
+                    store(gates, g + _2 * hidden, share)
+                    store(candidates, hidden * (at + i) + j, candidate)
+                    store(states, h + hidden * n, keep * (candidate + update * (load(states, h) - candidate)))
+                    j += _lanes
         begin = take(given)
 
 
-@njit(**_OPTIONS)
-def _step_back(given, product, grad, own, recurrent):
-    """The gradient of a step in front of its product; `back` becomes what passes it by, without the product.
-
-    Where nothing is rounded, `product` and `grad` are none: the product is in `back`, and `own` is the gradient.
-    """
-    n, t, hidden = given[1], given[2], given[3]
+@cfunc(ROW_LOOP, **_OPTIONS)
+def _backwards(given):
+    n, hidden, length = given[1], given[2], given[3]
     valid, first, gates, candidates = floats(given[4]), integers(given[5]), floats(given[6]), floats(given[7])
-    states, arrived, back = floats(given[8]), floats(given[9]), floats(given[10])
+    states, weight, arrived, back = floats(given[8]), floats(given[9]), floats(given[10]), floats(given[11])
+    grad, recurrent, of_biases = floats(given[12]), floats(given[13]), floats(given[14])
+    width, one = _3 * hidden, splat(_f4(1))
     begin = take(given)
     while begin < n:
-        for i in range(begin, min(begin + _u8(BLOCK), n)):
-            row, here = n * (_u8(first[i]) + t) + i, n * t + i
-            b, h, r, to, keep = hidden * i, hidden * here, _3 * hidden * here, _3 * hidden * row, valid[row]
-            to_r = to if grad is None else _3 * hidden * i
-            u, p, to_u, to_c = r + hidden, r + _2 * hidden, to_r + hidden, to_r + _2 * hidden
-            if product is not None:
-                for j in range(hidden):
-                    back[b + j] += load(product, b + j)
-            for j in range(hidden):
-                back[b + j] = keep * (back[b + j] + arrived[h + j])
-            for j in range(hidden):
-                own[to_c + j] = back[b + j] * (_f4(1) - candidates[h + j] * candidates[h + j])
-            for j in range(hidden):
-                own[to_u + j] = back[b + j] * (states[h + j] - candidates[h + j])
-            for j in range(hidden):
-                own[to_u + j] *= gates[u + j] * (_f4(1) - gates[u + j])
-                own[to_c + j] *= _f4(1) - gates[u + j]
-                back[b + j] *= gates[u + j]
-            for j in range(hidden):
-                store(recurrent, p + j, own[to_c + j] * gates[r + j])
-                own[to_r + j] = own[to_c + j] * gates[p + j] * gates[r + j] * (_f4(1) - gates[r + j])
-            for j in range(_2 * hidden):
-                store(recurrent, r + j, own[to_r + j])
-            if grad is not None:
-                for j in range(_3 * hidden):
-                    store(grad, to + j, own[to_r + j])
+        end = min(begin + _u8(BLOCK), n)
+        total = _4 * hidden * (begin // _u8(BLOCK))
+        for step in range(length):
+            t = length - _1 - _u8(step)
+            for i in range(begin, end):
+                row = n * (_u8(first[i]) + t) + i
+                keep = splat(valid[row])
+                j = _0
+                while j < hidden:
+                    to, b, h = width * row + j, hidden * i + j, hidden * (n * t + i) + j
+                    r = width * (n * t + i) + j
+                    u, p = r + hidden, r + _2 * hidden
+                    reset, update, candidate = load(gates, r), load(gates, u), load(candidates, h)
+                    of_state = keep * (load(back, b) + load(arrived, h))
+                    of_candidate = of_state * (one - update) * (one - candidate * candidate)
+                    of_update = of_state * (load(states, h) - candidate) * update * (one - update)
+                    of_share = of_candidate * reset
+                    of_reset = of_share * load(gates, p) * (one - reset)
+                    store(back, b, of_state * update)
+                    store(grad, to, of_reset)
+                    store(grad, to + hidden, of_update)
+                    store(grad, to + _2 * hidden, of_candidate)
+                    store(recurrent, r, of_reset)
+                    store(recurrent, u, of_update)
+                    store(recurrent, p, of_share)
+                    s = total + j
+                    store(of_biases, s, load(of_biases, s) + of_reset)
+                    store(of_biases, s + hidden, load(of_biases, s + hidden) + of_update)
+                    store(of_biases, s + _2 * hidden, load(of_biases, s + _2 * hidden) + of_candidate)
+                    store(of_biases, s + width, load(of_biases, s + width) + of_share)
+                    j += _lanes
+            if t > _0:
+                j = _0
+                while j < hidden:
+                    i = begin
+                    while i < end:
+                        r, b = width * (n * t + i), hidden * i + j
+                        if i + _rows <= end:
+                            _back_of_rows(recurrent, r, width, weight, width * j, width, back, b, hidden, _lanes)
+                            i += _rows
+                        else:
+                            _back_of_row(recurrent, r, width, weight, width * j, width, back, b, hidden, _lanes)
+                            i += _1
+                    j += _2 * _lanes
         begin = take(given)
-
-
-@cfunc(ROW_LOOP, **_OPTIONS)
-def _step_float32(given):
-    _step(given, floats(given[11]), None, None)
-
-
-@cfunc(ROW_LOOP, **_OPTIONS)
-def _step_bfloat16(given):
-    _step(given, bfloats(given[11]), bfloats(given[12]), bfloats(given[13]))
-
-
-@cfunc(ROW_LOOP, **_OPTIONS)
-def _step_back_float32(given):
-    _step_back(given, None, None, floats(given[14]), floats(given[13]))
-
-
-@cfunc(ROW_LOOP, **_OPTIONS)
-def _step_back_bfloat16(given):
-    _step_back(given, bfloats(given[11]), bfloats(given[12]), floats(given[14]), bfloats(given[13]))
-
-
-_STEPS = {torch.float32: _step_float32, torch.bfloat16: _step_bfloat16}
-_STEPS_BACK = {torch.float32: _step_back_float32, torch.bfloat16: _step_back_bfloat16}

@@ -109,19 +109,14 @@ def td3_update(
     policy.critic_optimizer.zero_grad()
     policy.actor_optimizer.zero_grad()
     loss.backward()
-    grad_norm = nn.utils.clip_grad_norm_(policy.critic_optimizer.param_groups[0]["params"], settings.max_grad_norm)
-    policy.critic_optimizer.step()
+    grad_norm = _step(policy.critic_optimizer, settings.max_grad_norm)
     if update_actor:
-        nn.utils.clip_grad_norm_(policy.actor_optimizer.param_groups[0]["params"], settings.max_grad_norm)
-        policy.actor_optimizer.step()
+        _step(policy.actor_optimizer, settings.max_grad_norm)
         with torch.no_grad():
-            pairs = list(zip(policy.critic_target.parameters(), policy.critic.parameters(), strict=True))
-            ours, theirs = (
-                (policy.actor_target.head, policy.actor.head) if shared else (policy.actor_target, policy.actor)
-            )
-            pairs += zip(ours.parameters(), theirs.parameters(), strict=True)
-            for target, new in pairs:
-                target.lerp_(new, settings.tau)
+            pairs = [(policy.critic_target, policy.critic)]
+            pairs += [(policy.actor_target.head, policy.actor.head) if shared else (policy.actor_target, policy.actor)]
+            targets, ours = ([p for pair in pairs for p in pair[i].parameters()] for i in (0, 1))
+            torch._foreach_lerp_(targets, ours, settings.tau)
     weighted = each.detach() if weights is None else weights * each.detach()
     return {
         "critic_loss": critic_loss.detach(),
@@ -131,6 +126,13 @@ def td3_update(
         "grad_norm": grad_norm.detach(),
         **record,
     }
+
+
+def _step(optimizer: torch.optim.Optimizer, max_norm: float) -> Tensor:
+    """Change the parameters by their gradients, which are clipped together; their norm before."""
+    norm = nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_norm, foreach=True)
+    optimizer.step()
+    return norm
 
 
 def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:

@@ -33,14 +33,14 @@ class ContextEncoder(nn.Module):
             nn.init.uniform_(parameter, -1.0 / math.sqrt(hidden), 1.0 / math.sqrt(hidden))
 
     def project(self, steps: Tensor) -> Tensor:
-        """The first layer's share of the inputs: (rows, n, inputs) → (rows, n, 3 hidden)."""
+        """The first layer's share of the inputs, without its bias: (rows, n, inputs) → (rows, n, 3 hidden)."""
         return self._product(self.inputs[0], steps)
 
     def _product(self, layer: nn.Module, x: Tensor) -> Tensor:
         assert isinstance(layer, nn.Linear)
         if not self.in_bfloat16:
-            return layer(x)
-        return functional.linear(x.bfloat16(), layer.weight.bfloat16(), layer.bias.bfloat16())
+            return functional.linear(x, layer.weight)
+        return functional.linear(x.bfloat16(), layer.weight.bfloat16()).float()
 
     def forward(self, projected: Tensor, valid: Tensor, length: int, first: Tensor | None = None) -> Tensor:
         """The context z (n, hidden) after the last step of each window.
@@ -55,13 +55,14 @@ class ContextEncoder(nn.Module):
         first = zeros if first is None else first
         steps = projected
         for layer, (inputs, recurrent) in enumerate(zip(self.inputs, self.recurrent, strict=True)):
+            assert isinstance(inputs, nn.Linear)
             assert isinstance(recurrent, nn.Linear)
             if layer:
                 steps = self._product(inputs, steps)
             if layer == 1:  # from here on rows are those of the windows
                 rows = first + torch.arange(length, device=first.device).unsqueeze(-1)
                 valid, first = valid[rows, torch.arange(len(first), device=first.device)], zeros
-            steps = gru(steps, valid, first, length, recurrent.weight, recurrent.bias)
+            steps = gru(steps, valid, first, length, inputs.bias, recurrent.weight, recurrent.bias)
         return steps[-1]
 
 

@@ -64,7 +64,7 @@ class MQLPolicy(BasePolicy):
         self.preset, self.uses_reward, self.uses_context = preset, uses_reward, uses_context
         self.history = history or shape.history
         self.context_terms = shape.context_terms(observation_space)
-        self.window_terms = (*self.context_terms, PREVIOUS_REWARD) if uses_reward else self.context_terms
+        self.window_terms = (PREVIOUS_REWARD, *self.context_terms) if uses_reward else self.context_terms
         self.context, self.actor, self.critic = shape.build(observation_space, self._actions, uses_reward)
         # Copied together, so that an encoder which both share stays shared.
         self.actor_target, self.critic_target = copy.deepcopy((self.actor, self.critic))
@@ -92,23 +92,20 @@ class MQLPolicy(BasePolicy):
 
     def steps(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """What the context encoder reads: (length, n, inputs), and which steps there were, (length, n)."""
-        terms = {name: self._by_step(windows.observation[name]) for name in self.window_terms}
-        read = [self._by_step(windows.action)]
-        if self.uses_reward:
-            read.append(terms[PREVIOUS_REWARD])
-        embed = self.critic.encoder.encoders if self.shares_encoder else None
-        read += [embed[name](terms[name]) if embed is not None else terms[name] for name in self.context_terms]
-        return torch.cat(read, -1), self._by_step(windows.valid)
-
-    def _by_step(self, rows: np.ndarray) -> Tensor:
-        return to_tensor(rows.swapaxes(0, 1), self.device)
+        steps, valid = (to_tensor(values, self.device) for values in (windows.steps, windows.valid))
+        if self.shares_encoder or tuple(windows.columns) != self.window_terms:
+            embed = self.critic.encoder.encoders if self.shares_encoder else {}
+            terms = {name: steps[..., windows.columns[name]] for name in self.window_terms}
+            read = [embed[name](term) if name in embed else term for name, term in terms.items()]
+            steps = torch.cat([steps[..., : self._actions], *read], -1)
+        return steps, valid
 
     def encode(self, windows: Windows) -> Tensor:
         """The context z (n, hidden) at the end of each window."""
         if not self.uses_context:
-            return torch.zeros(len(windows.action), self.context.hidden, device=self.device)
+            return torch.zeros(windows.valid.shape[1], self.context.hidden, device=self.device)
         steps, valid = self.steps(windows)
-        return self.context(self.context.project(steps), valid, windows.valid.shape[1])
+        return self.context(self.context.project(steps), valid, len(steps))
 
     def act(self, observation: Mapping[str, np.ndarray], windows: Windows) -> np.ndarray:
         """Actions in [-1, 1], (n, actions), without noise."""

@@ -22,46 +22,39 @@ from torch import Tensor
 from outlap.kernel_cache import discard_stale_kernels
 
 BLOCK = 32  # rows that a thread takes at a time
-ROWS_OF_THREAD = 128  # with fewer a second thread is not worth its start
-DTYPES = (torch.float32, torch.bfloat16, torch.int64)  # for `floats`, `bfloats` and `integers`
+ROWS_OF_THREAD = 64  # with fewer a second thread is not worth its start
+DTYPES = (torch.float32, torch.float16, torch.int64)  # for `floats`, `halves` and `integers`
 ROW_LOOP = types.void(types.CPointer(types.uint64))  # the signature of a kernel, for `numba.cfunc`
 
 
-class RowLoop:
-    """A kernel and what it works on.
+def row_loop(kernel: CFunc, rows: int, *given: int | Tensor) -> None:
+    """Have a kernel go through all rows.
 
-    A kernel is given one array: the first row that is not taken yet, rows, step, and then what the constructor was
-    given. It takes blocks of rows by `take` until none is left. Since rows are independent, any number of threads
-    gives the same.
+    A kernel is given one array: the first row that is not taken yet, rows, and then all that is given here. It takes
+    blocks of rows by `take` until none is left. Since blocks are independent, any number of threads gives the same.
+
+    Args:
+        kernel: of the signature ROW_LOOP.
+        rows: to go through.
+        given: whole numbers, and contiguous tensors of the CPU, by their addresses.
+
+    Raises ValueError for other tensors, and for types of number that a kernel cannot read.
     """
+    for tensor in (g for g in given if isinstance(g, Tensor)):
+        if not tensor.is_contiguous() or tensor.device.type != "cpu" or tensor.dtype not in DTYPES:
+            raise ValueError(f"a row loop takes contiguous tensors of the CPU, of {', '.join(map(str, DTYPES))}")
+    numbers = np.array([0, rows, *(g.data_ptr() if isinstance(g, Tensor) else g for g in given)], np.uint64)
+    threads = min(torch.get_num_threads(), rows // ROWS_OF_THREAD)
+    parallel = _parallel() if threads > 1 else None
+    if parallel is None:
+        kernel.ctypes(ctypes.cast(numbers.ctypes.data, ctypes.POINTER(ctypes.c_uint64)))
+    else:
+        parallel(kernel.address, numbers.ctypes.data, threads, 0)
 
-    def __init__(self, kernel: CFunc, rows: int, *given: int | Tensor) -> None:
-        """Note what the kernel works on.
 
-        Args:
-            kernel: of the signature ROW_LOOP.
-            rows: to go through.
-            given: whole numbers, and contiguous tensors of the CPU, by their addresses.
-
-        Raises ValueError for other tensors, and for types of number that a kernel cannot read.
-        """
-        for tensor in (g for g in given if isinstance(g, Tensor)):
-            if not tensor.is_contiguous() or tensor.device.type != "cpu" or tensor.dtype not in DTYPES:
-                raise ValueError(f"a row loop takes contiguous tensors of the CPU, of {', '.join(map(str, DTYPES))}")
-        self._kept = given  # tensors, from being freed
-        self._given = np.array([0, rows, 0, *(g.data_ptr() if isinstance(g, Tensor) else g for g in given)], np.uint64)
-        self._address = self._given.ctypes.data
-        self._kernel = kernel
-        self._threads = min(torch.get_num_threads(), rows // ROWS_OF_THREAD)
-
-    def __call__(self, step: int) -> None:
-        """Go through all rows."""
-        self._given[0], self._given[2] = 0, step
-        parallel = _parallel() if self._threads > 1 else None
-        if parallel is None:
-            self._kernel.ctypes(ctypes.cast(self._address, ctypes.POINTER(ctypes.c_uint64)))
-        else:
-            parallel(self._kernel.address, self._address, self._threads, 0)
+def blocks_of(rows: int) -> int:
+    """How many blocks so many rows are."""
+    return -(-rows // BLOCK)
 
 
 @cache
@@ -93,40 +86,19 @@ def _pointer(kind: types.Type):
     return at
 
 
-def _load(typingctx, numbers, index):
+def _widen(typingctx, half):
     def code(context, builder, signature, arguments):
-        value = builder.load(builder.gep(arguments[0], [arguments[1]]))
-        if numbers.dtype == types.float32:
-            return value
-        return builder.bitcast(builder.shl(builder.zext(value, _WORD), _WORD(16)), _FLOAT)
+        return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
 
-    return types.float32(numbers, index), code
+    return types.float32(types.uint16), code
 
-
-def _store(typingctx, numbers, index, value):
-    def code(context, builder, signature, arguments):
-        place, value = builder.gep(arguments[0], [arguments[1]]), arguments[2]
-        if numbers.dtype == types.float32:
-            builder.store(value, place)
-            return None
-        bits = builder.bitcast(value, _WORD)  # to the nearest, and of two to the even one
-        odd = builder.and_(builder.lshr(bits, _WORD(16)), _WORD(1))
-        rounded = builder.add(builder.add(bits, _WORD(0x7FFF)), odd)
-        builder.store(builder.trunc(builder.lshr(rounded, _WORD(16)), ir.IntType(16)), place)
-        return None
-
-    return types.void(numbers, index, types.float32), code
-
-
-_WORD, _FLOAT = ir.IntType(32), ir.FloatType()
 
 # In kernels:
 take: Any = intrinsic(_take)  # (given): the first row of a block, which no other thread gets
 integers: Any = intrinsic(_pointer(types.int64))  # (address): the numbers there
 floats: Any = intrinsic(_pointer(types.float32))
-bfloats: Any = intrinsic(_pointer(types.uint16))  # bfloat16, for `load` and `store`
-load: Any = intrinsic(_load)  # (floats or bfloats, index): float32
-store: Any = intrinsic(_store)  # (floats or bfloats, index, float32)
+halves: Any = intrinsic(_pointer(types.uint16))  # float16, for `widen`
+widen: Any = intrinsic(_widen)  # (a number of `halves`): float32
 
 
 @njit(cache=True)
@@ -134,4 +106,5 @@ def _probe():
     return 0
 
 
-discard_stale_kernels(_probe, [Path(__file__)])  # that are compiled from the above, too
+# Kernels are compiled from these, too.
+discard_stale_kernels(_probe, [Path(__file__), Path(__file__).with_name("lanes.py")])

@@ -1,0 +1,70 @@
+"""Registers in kernels: each operation against NumPy's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numba import njit
+
+from outlap.mql.lanes import LANES, ROWS, clip, load, product, splat, store
+from outlap.mql.torch_threads import floats
+
+ONE = np.uint64(1)
+
+
+def address(values: np.ndarray) -> np.uint64:
+    assert values.dtype == np.float32
+    assert values.flags.c_contiguous
+    return np.uint64(values.ctypes.data)
+
+
+@njit
+def operate(left, right, out):
+    a, b, lanes = load(floats(left), np.uint64(1)), load(floats(right), np.uint64(0)), np.uint64(LANES)
+    each = (a + b, a - b, a * b, a / b, clip(a, splat(np.float32(-0.5)), b))
+    for k in range(5):
+        store(floats(out), lanes * np.uint64(k), each[k])
+
+
+def test_operations_are_those_of_numpy_in_every_lane() -> None:
+    rng = np.random.default_rng(0)
+    left, right = rng.normal(size=LANES + 1).astype(np.float32), rng.uniform(0.1, 1.0, LANES).astype(np.float32)
+    left[3] = np.nan
+    out = np.empty((5, LANES), np.float32)
+    operate(address(left), address(right), address(out))
+    a = left[1:]
+    expected = [a + right, a - right, a * right, a / right, np.clip(a, np.float32(-0.5), right)]
+    np.testing.assert_array_equal(out, np.stack(expected))
+
+
+@pytest.mark.parametrize("rows", [1, ROWS])
+@pytest.mark.parametrize("registers", [2, 3])
+@pytest.mark.parametrize("adds", [False, True])
+def test_a_product_is_that_of_numpy_and_leaves_everything_else(rows: int, registers: int, adds: bool) -> None:
+    multiply: Any = product(rows, registers, adds=adds)
+
+    @njit
+    def call(a, a_first, a_row, b, b_first, height, c, c_first, c_row, c_apart):
+        multiply(floats(a), a_first, a_row, floats(b), b_first, height, floats(c), c_first, c_row, c_apart)
+
+    rng = np.random.default_rng(1)
+    height, apart, width = 19, LANES + 3, 200
+    a, b = (rng.normal(size=size).astype(np.float32) for size in ((rows, 24), (height, registers * LANES)))
+    c = rng.normal(size=(rows, width)).astype(np.float32)
+    before = c.copy()
+    first = 7
+    numbers = [address(a), 2, 24, address(b), 0, height, address(c), first, width, apart]
+    call(*(np.uint64(number) for number in numbers))
+    made = a[:, 2 : 2 + height].astype(np.float64) @ b
+    expected = before.astype(np.float64)
+    for register in range(registers):
+        place = slice(first + register * apart, first + register * apart + LANES)
+        part = made[:, register * LANES : (register + 1) * LANES]
+        expected[:, place] = part + before[:, place] if adds else part
+    np.testing.assert_allclose(c, expected, atol=1e-5)
+    touched = np.zeros(width, bool)
+    for register in range(registers):
+        touched[first + register * apart :][:LANES] = True
+    np.testing.assert_array_equal(c[:, ~touched], before[:, ~touched])
