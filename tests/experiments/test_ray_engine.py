@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import signal
@@ -24,7 +25,7 @@ from ray.cluster_utils import Cluster
 from fake_units import Fake, begun, ended
 from outlap.errors import OutlapError
 from outlap.experiments.engine import LocalEngine
-from outlap.experiments.ray_engine import RayEngine
+from outlap.experiments.ray_engine import RayEngine, _Board
 from outlap.experiments.runner import Status, run_units
 from outlap.experiments.store import Store
 from outlap.experiments.sweep import Range, SweepConfig
@@ -202,6 +203,18 @@ def test_ctrl_c_does_not_wait_for_the_next_report(cluster: Cluster, tmp_path: Pa
         assert not unit.is_done(tmp_path / "work")
 
 
+def test_units_hear_at_once_that_they_are_to_stop():
+    async def told() -> tuple[bool, bool, bool]:
+        board = _Board()
+        before = await board.report("first", 0.5, patience=0.0)
+        asked = asyncio.create_task(board.report("second", 0.25, patience=3600.0))
+        await asyncio.sleep(0.0)
+        assert board.stop() == {"first": 0.5, "second": 0.25}
+        return before, await asyncio.wait_for(asked, 60.0), await board.report("third", 0.0, patience=0.0)
+
+    assert asyncio.run(told()) == (False, True, True)
+
+
 def test_ctrl_c_ends_units_that_cannot_be_told(cluster: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     engine, unit = RayEngine(), Fake("deaf", until="never", silent=True)
     (tmp_path / ".lock").touch()
@@ -209,6 +222,7 @@ def test_ctrl_c_ends_units_that_cannot_be_told(cluster: Cluster, tmp_path: Path,
     engine.submit(unit)
     wait_for(lambda: begun(unit, tmp_path))
     ray.kill(engine._board)
+    wait_for(lambda: not engine.shares())  # it is gone a moment later
     engine.close()
     assert "cannot be told to stop" in caplog.text
     with FileLock(unit.folder(tmp_path) / ".lock", timeout=20.0):  # which the unit held

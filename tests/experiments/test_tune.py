@@ -45,10 +45,10 @@ def test_what_is_restored_tells_whoever_listens_now():
 
 @pytest.mark.parametrize("flag", ["--out", "--store"])
 def test_another_sweep_is_refused_where_one_was_begun(flag: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def interrupted(address: str | None) -> bool:
+    def interrupted(address: str | None) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tune, "join_cluster", interrupted)
+    monkeypatch.setattr(tune, "ray_cluster", interrupted)
     store = f"file://{tmp_path / 'store'}" if flag == "--store" else None
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):

@@ -6,19 +6,21 @@ Ray does its units again elsewhere, from what they had saved; those that were do
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from outlap.errors import OutlapError
 from outlap.experiments.engine import Outcome, do_unit
+from outlap.experiments.ray_cluster import import_ray, ray_cluster
 from outlap.experiments.store import Store
 from outlap.experiments.unit import Unit
 from outlap.processes import Interruptible, import_learning
@@ -26,34 +28,10 @@ from outlap.processes import Interruptible, import_learning
 log = logging.getLogger(__name__)
 
 RETRIES = 5  # of a unit whose process or machine is lost
-REPORT_EVERY = 1.0  # [s] between two reports of how far a unit is, each of which asks whether it is to stop
+REPORT_EVERY = 1.0  # [s] between two reports of how far a unit is
 STORE_EVERY = 120.0  # [s] between two copies of an unfinished unit in the store
 PATIENCE = 60.0  # [s] for units to save what they have, after Ctrl-C
 QUEUE = 10_000  # units that Ray may have at a time, most of them waiting: that is what clusters grow by
-
-
-def join_cluster(address: str | None) -> bool:
-    """Join a Ray cluster, or begin one of this machine; False if this process is in one already.
-
-    Raises OutlapError where Ray is not installed, or none answers.
-    """
-    ray = import_ray()
-    if ray.is_initialized():
-        return False
-    try:
-        ray.init(address=address, logging_level=logging.WARNING, log_to_driver=False)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise OutlapError(f"--address {address}: no Ray cluster answers there: {error}") from None
-    return True
-
-
-def import_ray() -> Any:
-    """The package. Raises OutlapError where it is not installed."""
-    try:
-        import ray
-    except ImportError:
-        raise OutlapError("Ray is not installed; get it with pip install 'outlap[distributed]'") from None
-    return ray
 
 
 @dataclass(frozen=True)
@@ -104,7 +82,7 @@ class RayEngine:
         self._tracks = dict(tracks or {})
         self._store = Store(store) if store else None
         self._running: dict[Any, Unit] = {}
-        self._began_ray = False
+        self._resources = ExitStack()
 
     @property
     def limit(self) -> int:
@@ -122,13 +100,16 @@ class RayEngine:
         if self._store is not None:
             self._store.check()
             self._exchange(units, self._store)
-        self._began_ray = join_cluster(self._address)
+        self._resources.enter_context(ray_cluster(self._address))
         here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
-        board = self._ray.remote(_Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
+        board = self._ray.remote(_Board).options(
+            num_cpus=0, max_restarts=-1, max_concurrency=QUEUE, scheduling_strategy=here
+        )
         self._board = board.remote()
         url = self._store.url if self._store else None
         self._orders = _Orders(self._work, url, self._tracks, Surroundings.here())
         self._task = self._ray.remote(num_cpus=1, max_retries=RETRIES)(_do_there)
+        self.shares()  # once it has answered, it hears at once that units are to stop
 
     def _exchange(self, units: Sequence[Unit], store: Store) -> None:
         """Fetch units that are done; put there what was done without the store, of the others and what they need."""
@@ -178,17 +159,19 @@ class RayEngine:
             return {}
 
     def close(self) -> None:
-        if self._running:
-            begun = self._stop()
-            for reference, unit in self._running.items():
-                if unit.key not in begun:
-                    self._ray.cancel(reference, force=True)  # it may be importing, which is not to be interrupted
-            working = [reference for reference, unit in self._running.items() if unit.key in begun]
-            if working:
-                ended, late = self._ray.wait(working, num_returns=len(working), timeout=PATIENCE)
-                self._warn_of_lost_work(ended, late)
-        if self._began_ray:
-            self._ray.shutdown()
+        with self._resources:
+            if self._running:
+                self._end_units()
+
+    def _end_units(self) -> None:
+        begun = self._stop()
+        for reference, unit in self._running.items():
+            if unit.key not in begun:
+                self._ray.cancel(reference, force=True)  # it may be importing, which is not to be interrupted
+        working = [reference for reference, unit in self._running.items() if unit.key in begun]
+        if working:
+            ended, late = self._ray.wait(working, num_returns=len(working), timeout=PATIENCE)
+            self._warn_of_lost_work(ended, late)
 
     def _stop(self) -> Mapping[str, float]:
         """Have units stop; those that have begun, by their keys."""
@@ -214,12 +197,14 @@ class _Board:
 
     def __init__(self) -> None:
         self._shares: dict[str, float] = {}
-        self._stopped = False
+        self._stopped = asyncio.Event()
 
-    def report(self, key: str, share: float) -> bool:
-        """Note how far a unit is; whether it is to stop."""
+    async def report(self, key: str, share: float, patience: float) -> bool:
+        """Note how far a unit is; whether it is to stop: no is the answer after `patience` seconds, yes at once."""
         self._shares[key] = share
-        return self._stopped
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._stopped.wait(), patience)
+        return self._stopped.is_set()
 
     def leave(self, key: str) -> None:
         """A unit does not run any more."""
@@ -230,7 +215,7 @@ class _Board:
 
     def stop(self) -> dict[str, float]:
         """Have all units stop; how far those are that have begun."""
-        self._stopped = True
+        self._stopped.set()
         return self._shares
 
 
@@ -255,7 +240,7 @@ class _Progress:
     @contextmanager
     def on_board(self) -> Iterator[None]:
         """All that Ctrl-C waits for, work or not. Raises KeyboardInterrupt where units are to stop already."""
-        if self._tell():
+        if self._tell(patience=0.0):
             raise KeyboardInterrupt
         threading.Thread(target=self._watch, daemon=True).start()
         try:
@@ -268,20 +253,21 @@ class _Progress:
         self.share = share
 
     def _watch(self) -> None:
-        while not self._over.wait(REPORT_EVERY):
-            if self._tell():
+        while not self._over.is_set():
+            if self._tell(REPORT_EVERY):
                 self.work.interrupt()
                 self._over.wait()  # until what it has done is saved
         self._board.leave.remote(self._key)
 
-    def _tell(self) -> bool:
-        """How far it is; whether it is to stop."""
+    def _tell(self, patience: float) -> bool:
+        """How far it is; whether it is to stop, see `_Board.report`."""
         import ray
         from ray.exceptions import RayError
 
         try:
-            return ray.get(self._board.report.remote(self._key, self.share), timeout=10.0)
+            return ray.get(self._board.report.remote(self._key, self.share, patience), timeout=10.0)
         except RayError:  # on its way to another machine: nobody says to stop
+            self._over.wait(patience)
             return False
 
 

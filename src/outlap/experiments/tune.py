@@ -16,7 +16,8 @@ from typing import Any
 import pandas as pd
 
 from outlap.errors import OutlapError
-from outlap.experiments.ray_engine import Surroundings, import_ray, join_cluster
+from outlap.experiments.ray_cluster import import_ray, ray_cluster
+from outlap.experiments.ray_engine import Surroundings
 from outlap.experiments.store import Store
 from outlap.experiments.sweep import SweepConfig
 from outlap.files import to_json
@@ -47,7 +48,7 @@ def tune_trials(
     Args:
         sweep: what is varied; each trial is trained once.
         folder: for Tune's own files, and the best run.
-        address: of a Ray cluster, see `join_cluster`.
+        address: of a Ray cluster, see `ray_cluster`.
         store: URL of an object store for the trials; None: all machines see `folder` under the same path.
         jobs: trials at a time; 0: as many as there are cores.
         gpu_share: of a GPU, for each trial on one.
@@ -75,9 +76,8 @@ def tune_trials(
     _claim(sweep, kept, "--store" if store else "--out")
     os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
     os.environ["TUNE_DISABLE_SIGINT_HANDLER"] = "1"  # or Ctrl-C makes `fit` return as if all was done
-    listening = LISTENER.set(on_trials)
-    began = join_cluster(address)
-    try:
+    with ray_cluster(address), contextlib.ExitStack() as last:
+        last.callback(LISTENER.reset, LISTENER.set(on_trials))
         surroundings = Surroundings.here()
         gpu = {"gpu": gpu_share} if configs[0].device.startswith("cuda") else {}
         trainable = tune.with_resources(lambda given: _trial(sweep, given[TRIAL], surroundings), {"cpu": 1, **gpu})
@@ -102,10 +102,6 @@ def tune_trials(
             )  # fmt: skip
         with contextlib.redirect_stdout(io.StringIO()):  # of Tune's own tables
             results = tuner.fit()
-    finally:
-        LISTENER.reset(listening)
-        if began:
-            import_ray().shutdown()
     rows, checkpoints = [], []
     for result in results:
         metrics = result.metrics or {}
