@@ -18,7 +18,7 @@ from numba.extending import intrinsic, overload, register_model
 
 def _register_file() -> tuple[int, int]:
     """Floats of a register, and rows of a `product` of which three registers each fit beside what they are made of."""
-    given = config.CPU_FEATURES
+    given = getattr(config, "CPU_FEATURES")  # noqa: B009 - Numba sets it from NUMBA_CPU_FEATURES
     features = llvm.get_host_cpu_features() if given is None else dict.fromkeys(given.replace("+", "").split(","), True)
     if features.get("avx512f"):
         return 16, 8  # of 32 registers

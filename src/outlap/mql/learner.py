@@ -115,8 +115,8 @@ def td3_update(
         with torch.no_grad():
             pairs = [(policy.critic_target, policy.critic)]
             pairs += [(policy.actor_target.head, policy.actor.head) if shared else (policy.actor_target, policy.actor)]
-            targets, ours = ([p for pair in pairs for p in pair[i].parameters()] for i in (0, 1))
-            torch._foreach_lerp_(targets, ours, settings.tau)
+            for target, new in pairs:
+                torch._foreach_lerp_(list(target.parameters()), list(new.parameters()), settings.tau)  # type: ignore
     weighted = each.detach() if weights is None else weights * each.detach()
     return {
         "critic_loss": critic_loss.detach(),
