@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,7 +91,7 @@ def main() -> None:
                     words = ["--resume", "full"]
                 rows.append(interrupt(name, words, moment, here))
                 show(rows[-1])
-    print(f"\nslowest: {max(row.seconds or 0.0 for row in rows):.2f} s")
+    print(f"\nslowest: {max(row.all_gone_s or row.seconds or 0.0 for row in rows):.2f} s")
     if flags.json:
         facts = {
             "command": " ".join(["python", *sys.argv]),
@@ -129,7 +130,8 @@ def interrupt(name: str, words: list[str], moment: float, cwd: Path) -> Interrup
         time.sleep(0.05)
     all_gone = None if left else round(time.monotonic() - begun, 2)
     for number in left:
-        os.kill(number, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
     return Interrupted(
         name, moment, round(seconds, 2), all_gone, process.returncode, "Traceback" in said, tail(said)
     )  # fmt: skip

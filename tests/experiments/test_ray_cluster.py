@@ -18,7 +18,7 @@ pytest.importorskip("ray", reason="needs Ray: pip install 'outlap[distributed]'"
 
 import ray
 
-from outlap.experiments.ray_cluster import ray_cluster
+from outlap.experiments.ray_cluster import MARK, ray_cluster
 
 linux = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="elsewhere Ray sees to its processes")
 
@@ -35,23 +35,29 @@ def usual_handler() -> Iterator[None]:
 @pytest.mark.usefixtures("usual_handler")
 def test_ctrl_c_comes_while_ray_begins_though_ray_passes_over_it(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[subprocess.Popen[bytes]] = []
-    released = threading.Event()
+    released, order = threading.Event(), []
 
     def init(**_: Any) -> None:
         begun.append(subprocess.Popen(["sleep", "600"]))
         with suppress(KeyboardInterrupt):  # as Python does in a fork
             os.kill(os.getpid(), signal.SIGINT)
             released.wait(5.0)  # as Ray waits for its processes in C++
+        order.append("first is over")
 
     monkeypatch.setattr(ray, "init", init)
     with pytest.raises(KeyboardInterrupt), ray_cluster("local"):
         pass
     assert begun[0].wait(timeout=30.0) == -signal.SIGKILL
+    monkeypatch.setattr(ray, "init", lambda **_: order.append("second"))
     released.set()
+    with ray_cluster("local"):
+        assert order == ["first is over", "second"]
+        assert MARK not in os.environ
 
 
 SCRIPT = """
 import subprocess
+import sys
 import ray
 from outlap.experiments.ray_cluster import ray_cluster
 
@@ -59,7 +65,11 @@ from outlap.experiments.ray_cluster import ray_cluster
 def work():
     subprocess.Popen(["sleep", "600"])
 
+JOINS = "from outlap.experiments.ray_cluster import ray_cluster\\nwith ray_cluster({!r}): pass"
+
 with ray_cluster("local"):
+    address = ray.get_runtime_context().gcs_address
+    subprocess.run([sys.executable, "-c", JOINS.format(address)], check=True)  # and leaves it as it is
     ray.get(work.remote())
     print(ray.is_initialized())
 print(ray.is_initialized())

@@ -662,7 +662,10 @@ def test_saving_that_fails_leaves_the_file_that_was_there(tmp_path: Path, monkey
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("broken", ["missing", "empty", "not an archive", "cut short", "lacks a column", "pickled"])
+@pytest.mark.parametrize(
+    "broken",
+    ["missing", "empty", "not an archive", "cut short", "lacks a column", "other numbers", "other axes", "pickled"],
+)
 def test_what_is_no_replay_is_an_error_that_names_the_file(broken: str, tmp_path: Path) -> None:
     path = by_hand().save(tmp_path / "replay.npz")
     whole = path.read_bytes()
@@ -679,6 +682,10 @@ def test_what_is_no_replay_is_an_error_that_names_the_file(broken: str, tmp_path
     elif broken == "lacks a column":
         del arrays["after"]
         np.savez(path, **arrays)
+    elif broken == "other numbers":
+        np.savez(path, **{**arrays, "observation/vel": arrays["observation/vel"].astype(np.int64)})
+    elif broken == "other axes":
+        np.savez(path, **{**arrays, "reward": arrays["reward"][:, None]})
     else:
         np.savez(path, **{**arrays, "task": np.array([object()])})  # type: ignore[arg-type]
     with pytest.raises(OutlapError, match=r"replay\.npz: cannot be read as a replay"):

@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -17,6 +18,7 @@ from outlap.errors import OutlapError
 from outlap.processes import process_environment
 
 MARK = "OUTLAP_CLUSTER"  # a variable in the environment of all processes that a cluster is begun with
+PATIENCE = 5.0  # [s] for killed processes to be gone
 
 
 def import_ray() -> Any:
@@ -35,6 +37,9 @@ def ray_cluster(address: str | None) -> Iterator[None]:
     One that was begun here ends with all its processes (on Linux; elsewhere Ray itself sees to them), after Ctrl-C as
     well, which comes at any moment. Raises OutlapError where Ray is not installed, or none answers.
     """
+    for stay in _LEFT_BEHIND:
+        stay.join()  # what it ends is of the whole process
+    _LEFT_BEHIND.clear()
     if import_ray().is_initialized():
         yield
         return
@@ -71,11 +76,12 @@ class _Stay(threading.Thread):
         except BaseException as error:
             self.begun.set_exception(error)
         self._over.wait()
-        node = ray._private.worker._global_node
-        if node is not None:
-            node.kill_monitor(check_alive=False)  # else `shutdown` waits for it, more than a second
-        ray.shutdown()
-        self._kill_processes()
+        try:
+            with suppress(AttributeError):  # not begun, or a version of Ray whose `shutdown` takes longer
+                ray._private.worker._global_node.kill_monitor(check_alive=False)  # else it is waited for, over a second
+            ray.shutdown()
+        finally:
+            self._kill_processes()
 
     def leave(self) -> None:
         """End what began; where it has not begun yet, its processes at once, and the rest when Ray hears of it."""
@@ -83,14 +89,20 @@ class _Stay(threading.Thread):
         if self.begun.done():
             self.join()
         else:
+            _LEFT_BEHIND.append(self)
             self._kill_processes()
 
     def _kill_processes(self) -> None:
         """Those that were begun here and are left, such as workers that had just been started."""
-        while left := _processes(self._name):  # the second look is for what they began meanwhile
+        until = time.monotonic() + PATIENCE
+        while (left := _processes(self._name)) and time.monotonic() < until:  # again, for what they began meanwhile
             for number in left:
-                with suppress(ProcessLookupError):
+                with suppress(OSError):  # gone, or another user's
                     os.kill(number, signal.SIGKILL)
+            time.sleep(0.01)
+
+
+_LEFT_BEHIND: list[_Stay] = []  # Ctrl-C came while Ray began, which nothing interrupts
 
 
 def _processes(name: str) -> set[int]:

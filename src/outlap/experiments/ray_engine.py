@@ -20,7 +20,7 @@ from typing import Any
 
 from outlap.errors import OutlapError
 from outlap.experiments.engine import Outcome, do_unit
-from outlap.experiments.ray_cluster import import_ray, ray_cluster
+from outlap.experiments.ray_cluster import MARK, import_ray, ray_cluster
 from outlap.experiments.store import Store
 from outlap.experiments.unit import Unit
 from outlap.processes import Interruptible, import_learning
@@ -44,7 +44,8 @@ class Surroundings:
     @classmethod
     def here(cls) -> Surroundings:
         """Those of this process."""
-        return cls(Path.cwd(), {name: value for name, value in os.environ.items() if name.startswith("OUTLAP_")})
+        ours = {name: value for name, value in os.environ.items() if name.startswith("OUTLAP_") and name != MARK}
+        return cls(Path.cwd(), ours)
 
     def settle_in(self) -> None:
         """Take them over, and keep one core busy, no more."""

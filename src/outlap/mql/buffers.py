@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.errors import OutlapError, brief
 from outlap.files import replacing
-from outlap.mql.gather import gather_rows
+from outlap.mql.gather import gather, gather_side_by_side
 
 NONE = -1  # serial of no row
 
@@ -253,7 +253,7 @@ class HistoryBuffer:
             length: rows of a window.
             terms: of the observation that are wanted.
         """
-        rows, _, _ = self._trace(serial, length, 0, 1.0)
+        rows, _, _ = self._positions(serial, length, 0, 1.0)
         return self._read(rows, terms)
 
     def gather(
@@ -268,34 +268,32 @@ class HistoryBuffer:
             gamma: discount of a step.
             terms: of the observation that the windows hold.
         """
-        n = len(serial)
-        rows, steps, reward = self._trace(serial, history, n_steps, gamma)
+        rows, steps, reward = self._positions(serial, history, n_steps, gamma)
         first, last = rows[history - 1], rows[-1]
-        ends, columns = gather_rows(self.observation, np.concatenate([first, last]))
         return Batch(
             serial=np.asarray(serial),
             task=self.task[first],
             windows=self._read(rows, terms),
-            observation={name: ends[:n, place] for name, place in columns.items()},
-            next_observation={name: ends[n:, place] for name, place in columns.items()},
+            observation=gather(self.observation, first),
+            next_observation=gather(self.observation, last),
             action=self.action[rows[history]],
             reward=reward,
             discount=np.where(self.terminated[last], 0.0, gamma**steps).astype(np.float32),
             steps=steps,
         )
 
-    def _trace(
+    def _positions(
         self, serial: np.ndarray, history: int, n_steps: int, gamma: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `_trace`; NONE before the episode or the ring began."""
+        """See `_trace`."""
         given = np.asarray(serial, np.int64), self.before, self.after, self.reward
         return _trace(*given, self.oldest, history, n_steps, gamma)
 
     def _read(self, rows: np.ndarray, terms: Sequence[str]) -> Windows:
         sources = {"": self.action, **{name: self.observation[name] for name in terms}}
-        steps, columns = gather_rows(sources, rows.ravel())
+        steps, columns = gather_side_by_side(sources, rows.ravel())
         columns.pop("")
-        return Windows(steps.reshape(*rows.shape, -1), columns, rows != NONE)
+        return Windows(steps.reshape(*rows.shape, steps.shape[1]), columns, rows != NONE)
 
     def _add(self, worlds, observation, action, reward, terminated, before, tasks) -> None:
         serial = self.added + np.arange(len(worlds))
@@ -331,6 +329,16 @@ class HistoryBuffer:
             np.savez(file, **arrays)  # type: ignore[arg-type]
         return Path(path)
 
+    def _check_columns(self) -> None:
+        """Raises ValueError for columns that kernels do not read."""
+        for name, (kind, axes) in ROW_FIELDS.items():
+            column = getattr(self, name)
+            if column.dtype != kind or column.ndim != axes:
+                raise ValueError(f"{name} is {column.dtype} with {column.ndim} axes")
+        for name, column in self.observation.items():
+            if column.dtype not in (np.float16, np.float32) or column.ndim != 2:
+                raise ValueError(f"observation/{name} is {column.dtype} with {column.ndim} axes")
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> HistoryBuffer:
         """Read what `save` wrote; runs no code from the file. Raises OutlapError where it is missing or broken."""
@@ -351,6 +359,7 @@ class HistoryBuffer:
             }
             for name in ROW_FIELDS:
                 setattr(buffer, name, _grown(arrays[name], buffer.capacity))
+            buffer._check_columns()
             buffer._departures = []
             for number, (added, ascending) in enumerate(facts["departures"]):
                 recent = _Recent(buffer.task_capacity)
@@ -365,7 +374,10 @@ class HistoryBuffer:
         return buffer
 
 
-ROW_FIELDS = ("action", "reward", "terminated", "before", "after", "task")
+ROW_FIELDS = {  # type of number and axes
+    "action": (np.float32, 2), "reward": (np.float32, 1), "terminated": (np.bool_, 1),
+    "before": (np.int64, 1), "after": (np.int64, 1), "task": (np.int64, 1),
+}  # fmt: skip
 
 
 class _Recent:

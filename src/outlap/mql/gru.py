@@ -1,7 +1,7 @@
 """A GRU layer over windows, with its gradient written out.
 
 On a CPU a thread takes some windows through all their steps, so that what it works on stays in its cache: one kernel
-forwards, one back. The two large products of the gradient are PyTorch's.
+forwards, one back. Only the product that is the weights' gradient is PyTorch's.
 """
 
 from __future__ import annotations

@@ -20,9 +20,10 @@ def _register_file() -> tuple[int, int]:
     """Floats of a register, and rows of a `product` of which three registers each fit beside what they are made of."""
     given = getattr(config, "CPU_FEATURES")  # noqa: B009 - Numba sets it from NUMBA_CPU_FEATURES
     features = llvm.get_host_cpu_features() if given is None else dict.fromkeys(given.replace("+", "").split(","), True)
-    if features.get("avx512f"):
+    avx = getattr(config, "ENABLE_AVX")  # noqa: B009
+    if avx and features.get("avx512f"):
         return 16, 8  # of 32 registers
-    return (8, 4) if features.get("avx2") else (4, 4)  # of 16
+    return (8, 4) if avx and features.get("avx2") else (4, 4)  # of 16
 
 
 LANES, ROWS = _register_file()
@@ -121,14 +122,14 @@ def product(rows: int, registers: int, *, adds: bool) -> Any:
     """A kernel's function for C = A B, or C += A B, of so many rows and `registers` · LANES columns.
 
     Called with (a, its first number, its row's length, b, its first number, its height, c, its first number, its row's
-    length, from one register's columns to the next). B lies row by row, without gaps (see `packed`).
+    length, from one register's columns to the next). B lies row by row, without gaps.
     """
 
     def compute(typingctx, a, a_first, a_row, b, b_first, height, c, c_first, c_row, c_apart):
         def code(context, builder, signature, given):
             a, a_first, a_row, b, b_first, height, c, c_first, c_row, c_apart = given
-            fma = cgutils.get_or_insert_function(
-                builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), f"llvm.fma.v{LANES}f32"
+            fma = cgutils.get_or_insert_function(  # in one where the processor can
+                builder.module, ir.FunctionType(_VECTOR, [_VECTOR] * 3), f"llvm.fmuladd.v{LANES}f32"
             )
             zero = ir.Constant(_VECTOR, [0.0] * LANES)
             sums = [[cgutils.alloca_once_value(builder, zero) for _ in range(registers)] for _ in range(rows)]

@@ -116,7 +116,7 @@ def td3_update(
             pairs = [(policy.critic_target, policy.critic)]
             pairs += [(policy.actor_target.head, policy.actor.head) if shared else (policy.actor_target, policy.actor)]
             for target, new in pairs:
-                torch._foreach_lerp_(list(target.parameters()), list(new.parameters()), settings.tau)  # type: ignore
+                torch._foreach_lerp_(list(target.parameters()), list(new.parameters()), settings.tau)  # type: ignore[arg-type]
     weighted = each.detach() if weights is None else weights * each.detach()
     return {
         "critic_loss": critic_loss.detach(),
@@ -130,7 +130,7 @@ def td3_update(
 
 def _step(optimizer: torch.optim.Optimizer, max_norm: float) -> Tensor:
     """Change the parameters by their gradients, which are clipped together; their norm before."""
-    norm = nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_norm, foreach=True)
+    norm = nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_norm)
     optimizer.step()
     return norm
 

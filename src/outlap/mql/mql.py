@@ -219,7 +219,7 @@ class MQL(OffPolicyAlgorithm):
 
 @contextmanager
 def _in_bfloat16(policy: MQLPolicy) -> Iterator[None]:
-    """The context's products are made in bfloat16 if the preset says so, on a CPU that computes with it."""
+    """The products of the context's inputs are made in bfloat16 if the preset says so and the CPU computes with it."""
     policy.context.in_bfloat16 = policy.trains_in_bfloat16 and policy.device.type == "cpu" and _computes_in_bfloat16()
     try:
         yield

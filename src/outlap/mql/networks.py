@@ -26,7 +26,7 @@ class ContextEncoder(nn.Module):
     def __init__(self, inputs: int, hidden: int, layers: int) -> None:
         super().__init__()
         self.hidden = hidden
-        self.in_bfloat16 = False  # round the factors of products so
+        self.in_bfloat16 = False  # round the factors of the inputs' products so
         self.inputs = nn.ModuleList(nn.Linear(inputs if i == 0 else hidden, 3 * hidden) for i in range(layers))
         self.recurrent = nn.ModuleList(nn.Linear(hidden, 3 * hidden) for _ in range(layers))
         for parameter in self.parameters():
@@ -152,7 +152,7 @@ class Preset:
     """How the networks are built; the class attributes are what presets differ in."""
 
     history = 10  # steps that the context is made of
-    context_hidden = 128
+    context_hidden = 128  # on a CPU, multiples of two registers, 32 with AVX-512, are several times as fast
     context_layers = 2
     hidden: tuple[int, ...] = (256, 256)  # of actor and critics
     layer_norm = False  # in the critics

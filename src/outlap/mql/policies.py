@@ -93,12 +93,13 @@ class MQLPolicy(BasePolicy):
     def steps(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """What the context encoder reads: (length, n, inputs), and which steps there were, (length, n)."""
         steps, valid = (to_tensor(values, self.device) for values in (windows.steps, windows.valid))
-        if self.shares_encoder or tuple(windows.columns) != self.window_terms:
-            embed = self.critic.encoder.encoders if self.shares_encoder else {}
-            terms = {name: steps[..., windows.columns[name]] for name in self.window_terms}
-            read = [embed[name](term) if name in embed else term for name, term in terms.items()]
-            steps = torch.cat([steps[..., : self._actions], *read], -1)
-        return steps, valid
+        if not self.shares_encoder and tuple(windows.columns) == self.window_terms:
+            return steps, valid
+        embed = self.critic.encoder.encoders if self.shares_encoder else {}
+        rows = steps.flatten(0, 1)  # whose columns a layer reads where they are
+        terms = {name: rows[:, windows.columns[name]] for name in self.window_terms}
+        read = [embed[name](term) if name in embed else term for name, term in terms.items()]
+        return torch.cat([rows[:, : self._actions], *read], -1).unflatten(0, valid.shape), valid
 
     def encode(self, windows: Windows) -> Tensor:
         """The context z (n, hidden) at the end of each window."""
