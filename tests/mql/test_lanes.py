@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,3 +73,28 @@ def test_a_product_is_that_of_numpy_and_leaves_everything_else(rows: int, regist
     for register in range(registers):
         touched[first + register * apart :][:LANES] = True
     np.testing.assert_array_equal(c[:, ~touched], before[:, ~touched])
+
+
+OLDER = """
+import numpy as np, torch
+from outlap.mql.gather import gather
+from outlap.mql.gru import gru
+from outlap.mql.lanes import LANES
+
+halves = np.arange(-30, 30).astype(np.float16)[:, None]
+found = gather({"halves": halves}, np.arange(60))["halves"]
+weight, bias, projected = torch.randn(24, 8), torch.randn(24), torch.randn(3, 9, 24)
+valid, first = torch.ones(3, 9), torch.zeros(9, dtype=torch.int64)
+states = gru(projected, valid, first, 3, bias, weight, bias)
+exact = gru(projected.double(), valid.double(), first, 3, bias.double(), weight.double(), bias.double())
+print(LANES, (found == halves).all(), float((states - exact).abs().max()) < 1e-5)
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="of processors of this kind")
+def test_an_older_processor_has_smaller_registers_and_the_same_results(tmp_path: Path) -> None:
+    older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path)}
+    said = subprocess.run(
+        [sys.executable, "-c", OLDER], env={**os.environ, **older}, capture_output=True, text=True, check=True
+    )
+    assert said.stdout.split() == ["4", "True", "True"]

@@ -87,8 +87,16 @@ def _pointer(kind: types.Type):
 
 
 def _widen(typingctx, half):
+    # Moved to a float's place the exponent is 112 too small. LLVM's own conversion ends the process without F16C.
     def code(context, builder, signature, arguments):
-        return builder.fpext(builder.bitcast(arguments[0], ir.HalfType()), ir.FloatType())
+        word, number = ir.IntType(32), ir.FloatType()
+        bits = builder.zext(arguments[0], word)
+        small = builder.shl(builder.and_(bits, word(0x7FFF)), word(13))
+        exact = builder.bitcast(builder.fmul(builder.bitcast(small, number), number(2.0**112)), word)
+        endless = builder.icmp_unsigned(">=", small, word(0x7C00 << 13))  # or no number
+        exact = builder.select(endless, builder.or_(small, word(0x7F800000)), exact)
+        sign = builder.shl(builder.and_(bits, word(0x8000)), word(16))
+        return builder.bitcast(builder.or_(exact, sign), number)
 
     return types.float32(types.uint16), code
 
