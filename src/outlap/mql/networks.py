@@ -191,7 +191,7 @@ class Preset:
 class Paper(Preset):
     """The networks of the paper: its GRU reads whole observations as they are.
 
-    The context's products in bfloat16 change its gradient by 1 to 2 %; another batch by ten times that.
+    Products of inputs in bfloat16 change the context's gradient by 1 to 2 %; another batch by twenty times that.
     """
 
     trains_in_bfloat16 = True
