@@ -152,7 +152,7 @@ class Preset:
     """How the networks are built; the class attributes are what presets differ in."""
 
     history = 10  # steps that the context is made of
-    context_hidden = 128  # on a CPU, multiples of two registers, 32 with AVX-512, are several times as fast
+    context_hidden = 128  # a multiple of two registers, 32 with AVX-512: others leave the kernels of a CPU, see `gru`
     context_layers = 2
     hidden: tuple[int, ...] = (256, 256)  # of actor and critics
     layer_norm = False  # in the critics
