@@ -66,7 +66,7 @@ def plain_losses(p: MQLPolicy, batch, n_steps: int):
     def z(columns: torch.Tensor) -> torch.Tensor:
         steps, valid = p.steps(batch.windows)
         each, rows = torch.arange(len(columns)), columns.t()
-        return p.context(p.context.project(steps[rows, each]), valid[rows, each], len(rows))
+        return p.context(steps[rows, each], valid[rows, each], len(rows))[0]
 
     here = torch.arange(5)[None].expand(len(batch.action), 5)
     there = here + torch.as_tensor(batch.steps)[:, None]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from outlap.mql.gru import gru
+from outlap.mql.gru import Layer, gru
 from outlap.mql.lanes import LANES
 from outlap.mql.networks import PRESETS, ContextEncoder, ScanConvolution, TwinMLP
 
@@ -35,7 +35,7 @@ def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int,
         other.data.copy_(mine.data)
     steps = torch.randn(6, 4, 7, dtype=dtype, requires_grad=True)
     weight = torch.randn(4, hidden, dtype=dtype)
-    z = ours(ours.project(steps), torch.ones(6, 4, dtype=dtype), 6)
+    z, _ = ours(steps, torch.ones(6, 4, dtype=dtype), 6)
     expected = theirs(steps)[1][-1]
     torch.testing.assert_close(z, expected)
     gradients = torch.autograd.grad((z * weight).sum(), [steps, *(mine for mine, _ in pairs)])
@@ -44,44 +44,71 @@ def test_the_context_is_that_of_pytorchs_gru_and_so_is_its_gradient(layers: int,
         torch.testing.assert_close(got, want)
 
 
-@pytest.mark.parametrize("length", [1, 4])
+def layers_of(number: int, inputs: int, hidden: int) -> list[Layer]:
+    layers = []
+    for size in (inputs, *(number - 1) * [hidden]):
+        shapes = (3 * hidden, size), (3 * hidden,), (3 * hidden, hidden), (3 * hidden,)
+        layers.append(Layer(*((2.0 * torch.randn(s) / s[-1] ** 0.5).requires_grad_() for s in shapes)))
+    return layers
+
+
+def as_given(hidden: int) -> Layer:
+    """A layer whose inputs are what its gates see, exactly, and whose state they do not see."""
+    zero = torch.zeros(3 * hidden)
+    return Layer(torch.eye(3 * hidden), zero, torch.zeros(3 * hidden, hidden), zero)
+
+
+@pytest.mark.parametrize(("length", "number"), [(1, 1), (4, 1), (4, 2), (4, 3)])
 @pytest.mark.parametrize(("n", "threads"), [(19, 1), (300, 2)])
 def test_the_kernels_do_what_the_operations_do_where_windows_begin_and_episodes_too(
-    length: int, n: int, threads: int, request: pytest.FixtureRequest
+    length: int, number: int, n: int, threads: int, request: pytest.FixtureRequest
 ) -> None:
     request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
     torch.set_num_threads(threads)
     torch.manual_seed(1)
-    hidden, rows = 6 * LANES, 6
-    projected = (2.0 * torch.randn(rows, n, 3 * hidden)).requires_grad_()
+    hidden, rows, inputs = 6 * LANES, 6, 11
+    steps = torch.randn(rows, n, inputs, requires_grad=True)
     valid = (torch.arange(rows)[:, None] >= torch.randint(0, 4, (n,))).float()
-    first = torch.randint(0, rows - length + 1, (n,))
-    weight = (2.0 * torch.randn(3 * hidden, hidden) / hidden**0.5).requires_grad_()
-    biases = [torch.randn(3 * hidden, requires_grad=True) for _ in range(2)]
-    upstream = torch.randn(length, n, hidden)
-    given = projected, biases[0], weight, biases[1]
-    found = gru(projected, valid, first, length, *given[1:])
-    wide = [tensor.detach().double().requires_grad_() for tensor in given]
-    expected = gru(wide[0], valid.double(), first, length, *wide[1:])
+    later = torch.randint(0, rows - length + 1, (n,))
+    layers = layers_of(number, inputs, hidden)
+    upstream = torch.randn(n, hidden)
+    found, found_later = gru(steps, valid, length, layers, later)
+    wide = [Layer(*(tensor.detach().double().requires_grad_() for tensor in layer)) for layer in layers]
+    wide_steps = steps.detach().double().requires_grad_()
+    expected, expected_later = gru(wide_steps, valid.double(), length, wide, later)
+    assert found_later is not None
+    assert expected_later is not None
+    assert not found_later.requires_grad
+    assert not expected_later.requires_grad
     torch.testing.assert_close(found, expected.float(), atol=2e-6, rtol=0.0)
-    gradients = torch.autograd.grad((found * upstream).sum(), given)
-    wanted = torch.autograd.grad((expected * upstream.double()).sum(), wide)
+    torch.testing.assert_close(found_later, expected_later.float(), atol=2e-6, rtol=0.0)
+    gradients = torch.autograd.grad((found * upstream).sum(), [steps, *(p for layer in layers for p in layer)])
+    wanted = torch.autograd.grad(
+        (expected * upstream.double()).sum(), [wide_steps, *(p for layer in wide for p in layer)]
+    )
     for got, want in zip(gradients, wanted, strict=True):
-        torch.testing.assert_close(got, want.float(), atol=1e-5, rtol=1e-5)
+        assert (got - want).norm() <= 2e-6 * want.norm()
     with torch.no_grad():
-        torch.testing.assert_close(gru(projected, valid, first, length, *given[1:]), found, atol=0.0, rtol=0.0)
+        torch.testing.assert_close(gru(steps, valid, length, layers)[0], found, atol=0.0, rtol=0.0)
 
 
 def test_the_kernels_compute_every_window_alike_wherever_it_is_in_a_batch() -> None:
     torch.manual_seed(3)
     hidden, rows, n = 2 * LANES, 5, 77  # some in groups, and some one by one
-    projected, valid = torch.randn(rows, n, 3 * hidden), torch.ones(rows, n)
-    first, biases = torch.zeros(n, dtype=torch.int64), torch.randn(2, 3 * hidden)
-    weight = torch.randn(3 * hidden, hidden) / hidden**0.5
-    together = gru(projected, valid, first, rows, biases[0], weight, biases[1])
+    layers = [as_given(hidden)._replace(weight=torch.randn(3 * hidden, hidden)), *layers_of(1, hidden, hidden)]
+    steps, valid = torch.randn(rows, n, 3 * hidden), torch.ones(rows, n)
+    together, _ = gru(steps, valid, rows, layers)
     for i in range(n):
-        alone = gru(projected[:, [i]], valid[:, [i]], first[[i]], rows, biases[0], weight, biases[1])
-        torch.testing.assert_close(alone[:, 0], together[:, i], atol=0.0, rtol=0.0)
+        alone, _ = gru(steps[:, [i]], valid[:, [i]], rows, layers)
+        torch.testing.assert_close(alone[0], together[i], atol=0.0, rtol=0.0)
+
+
+def test_a_gradient_that_is_wanted_twice_is_refused() -> None:
+    steps = torch.randn(3, 5, 4, requires_grad=True)
+    z, _ = gru(steps, torch.ones(3, 5), 3, layers_of(1, 4, 2 * LANES))
+    z.sum().backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="once"):
+        z.sum().backward()
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -89,33 +116,43 @@ def test_the_context_does_not_depend_on_the_types_of_what_is_given(number: int) 
     torch.manual_seed(4)
     exact = ContextEncoder(7, 5, number)
     rounded = copy.deepcopy(exact).bfloat16()
-    steps, valid, first = torch.randn(6, 4, 7), torch.ones(6, 4), torch.tensor([0, 1, 1, 0])
-    z = exact(exact.project(steps), valid, 5, first)
-    assert rounded(rounded.project(steps.bfloat16()), valid.bool(), 5, first.int()).dtype == torch.bfloat16
-    torch.testing.assert_close(
-        rounded(rounded.project(steps.bfloat16()), valid.bool(), 5, first.int()).float(), z, atol=0.03, rtol=0.0
-    )
+    steps, valid, later = torch.randn(6, 4, 7), torch.ones(6, 4), torch.tensor([0, 1, 1, 0])
+    exactly = exact(steps, valid, 5, later)
+    for found, expected in zip(rounded(steps.bfloat16(), valid.bool(), 5, later.int()), exactly, strict=True):
+        assert found.dtype == torch.bfloat16
+        torch.testing.assert_close(found.float(), expected, atol=0.03, rtol=0.0)
 
 
 @pytest.mark.parametrize(
-    ("first", "length", "mask"), [([0, 2], 4, (5, 2)), ([-1, 0], 4, (5, 2)), ([0, 0], 6, (5, 2)), ([0, 0], 4, (1, 2))]
+    ("later", "length", "mask"),
+    [([0, 2], 4, (5, 2)), ([-1, 0], 4, (5, 2)), ([0, 0], 6, (5, 2)), ([0, 0], 4, (1, 2)), ([0], 4, (5, 2))],
 )
-def test_windows_that_leave_the_rows_are_refused(first: list[int], length: int, mask: tuple[int, int]) -> None:
+@pytest.mark.parametrize("hidden", [3, 2 * LANES])
+def test_windows_that_leave_the_rows_are_refused(
+    later: list[int], length: int, mask: tuple[int, int], hidden: int
+) -> None:
     with pytest.raises(ValueError, match="do not fit"):
-        gru(
-            torch.zeros(5, 2, 9), torch.ones(mask), torch.tensor(first), length, torch.zeros(9), torch.zeros(9, 3),
-            torch.zeros(9),
-        )  # fmt: skip
+        gru(torch.zeros(5, 2, 4), torch.ones(mask), length, layers_of(2, 4, hidden), torch.tensor(later))
+
+
+@pytest.mark.parametrize("field", Layer._fields)
+@pytest.mark.parametrize("which", [0, 1])
+def test_weights_of_other_shapes_are_refused(which: int, field: str) -> None:
+    layers = layers_of(2, 4, 2 * LANES)
+    layers[which] = layers[which]._replace(**{field: torch.zeros(6 * LANES, 2 * LANES + 1)})
+    with pytest.raises(ValueError, match="do not fit"):
+        gru(torch.zeros(5, 2, 4), torch.ones(5, 2), 5, layers)
 
 
 def test_gates_saturate_where_inputs_are_huge_and_hide_no_nan() -> None:
-    inputs = torch.tensor([-1e30, -30.0, 0.0, 30.0, 1e30, float("nan")])
+    inputs = torch.tensor([-1e30, -30.0, 0.0, 30.0, 1e30])
     hidden = 2 * LANES
-    zero, weight = torch.zeros(3 * hidden), torch.zeros(3 * hidden, hidden)
-    projected = inputs[None, :, None].expand(1, 6, 3 * hidden)
-    states = gru(projected, torch.ones(1, 6), torch.zeros(6, dtype=torch.int64), 1, zero, weight, zero)
-    expected = torch.tensor([-1.0, -1.0, 0.0, 0.0, 0.0, float("nan")])[:, None].expand(6, hidden)
-    torch.testing.assert_close(states[0], expected, atol=1e-7, rtol=0.0, equal_nan=True)
+    steps = inputs[None, :, None].expand(1, 5, 3 * hidden)
+    z, _ = gru(steps, torch.ones(1, 5), 1, [as_given(hidden)])
+    expected = torch.tensor([-1.0, -1.0, 0.0, 0.0, 0.0])[:, None].expand(5, hidden)
+    torch.testing.assert_close(z, expected, atol=1e-7, rtol=0.0)
+    z, _ = gru(torch.full((1, 5, 3 * hidden), torch.nan), torch.ones(1, 5), 1, [as_given(hidden)])
+    assert z.isnan().all()
 
 
 def test_what_was_before_an_episode_changes_nothing() -> None:
@@ -124,8 +161,8 @@ def test_what_was_before_an_episode_changes_nothing() -> None:
     steps = torch.randn(6, 2, 3)
     valid = torch.ones(6, 2)
     valid[:2] = 0.0
-    z = encoder(encoder.project(steps), valid, 6)
-    torch.testing.assert_close(z, encoder(encoder.project(steps[2:]), valid[2:], 4))
+    z, _ = encoder(steps, valid, 6)
+    torch.testing.assert_close(z, encoder(steps[2:], valid[2:], 4)[0])
 
 
 def test_in_bfloat16_the_context_and_its_gradient_are_nearly_the_same() -> None:
@@ -134,7 +171,7 @@ def test_in_bfloat16_the_context_and_its_gradient_are_nearly_the_same() -> None:
     steps, weight = torch.randn(8, 64, 200), torch.randn(64, 32)
     found = []
     for encoder.in_bfloat16 in (False, True):
-        z = encoder(encoder.project(steps), torch.ones(8, 64), 8)
+        z, _ = encoder(steps, torch.ones(8, 64), 8)
         assert z.dtype == torch.float32
         found.append((z, *torch.autograd.grad((z * weight).sum(), list(encoder.parameters()))))
     for exact, rounded in zip(*found, strict=True):

@@ -1,12 +1,13 @@
-"""A GRU layer over windows, with its gradient written out.
+"""A stack of GRU layers over windows, with its gradient written out.
 
-On a CPU a thread takes some windows through all their steps, so that what it works on stays in its cache: one kernel
-forwards, one back. Only the product that is the weights' gradient is PyTorch's.
+On a CPU a thread takes some windows through all their steps and layers, so that what it works on stays in its cache:
+one kernel forwards, one back. The products of the first layer's inputs and of the weights' gradients are PyTorch's.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,121 +19,208 @@ from outlap.mql.lanes import LANES, ROWS, clip, load, product, splat, store
 from outlap.mql.torch_threads import BLOCK, ROW_LOOP, blocks_of, floats, integers, row_loop, take
 
 
+class Layer(NamedTuple):
+    """What makes V x + a of a layer's inputs x, and W h + b of its state h; their rows are those of r, u and c."""
+
+    input_weight: Tensor  # (3 hidden, inputs) V
+    input_bias: Tensor  # (3 hidden,) a
+    weight: Tensor  # (3 hidden, hidden) W
+    bias: Tensor  # (3 hidden,) b
+
+
 def gru(
-    projected: Tensor, valid: Tensor, first: Tensor, length: int, input_bias: Tensor, weight: Tensor, bias: Tensor
-) -> Tensor:
-    """The hidden state after every step of each window, from 0: (length, n, hidden).
+    steps: Tensor,
+    valid: Tensor,
+    length: int,
+    layers: Sequence[Layer],
+    later: Tensor | None = None,
+    *,
+    in_bfloat16: bool = False,
+) -> tuple[Tensor, Tensor | None]:
+    """The last layer's state after a window's last step, from 0; and that of a later window, without gradient.
 
-    r, u = σ(x + W h + b)  ·  c = tanh(x + r (W h + b))  ·  h' = c + u (h - c)
+    r, u = σ(V x + a + W h + b)  ·  c = tanh(V x + a + r (W h + b))  ·  h' = c + u (h - c)
 
-    Cho et al. (2014), with the reset gate behind the recurrent product as in cuDNN and `torch.nn.GRU`.
+    Cho et al. (2014), with the reset gate behind the recurrent product as in cuDNN and `torch.nn.GRU`. Both windows
+    share V x of the first layer, most of the work. Its gradient can be had once: going back overwrites what it needs.
 
     Args:
-        projected: (rows, n, 3 hidden) and
-        input_bias: (3 hidden,), together the inputs' share x of r, u and c.
-        valid: (rows, n), 0 where the state is held at 0.
-        first: int64 (n,) the row where each window begins.
-        length: rows of a window.
-        weight: (3 hidden, hidden) W and
-        bias: (3 hidden,) b of the recurrent product.
+        steps: (rows, n, inputs) x of the first layer; that of the others is the state of the layer before.
+        valid: (rows, n), 0 where the states are held at 0.
+        length: rows of a window; the one with a gradient has the first ones.
+        layers: of one hidden size.
+        later: int64 (n,) the row where the later window begins; by default there is none.
+        in_bfloat16: round so the factors of the first layer's V x and of its gradients.
+
+    Returns:
+        (n, hidden) of the window, and of the later one.
 
     Raises ValueError where shapes do not fit, or a window leaves the rows.
     """
-    rows, n, width = projected.shape
-    fit = width == len(weight) == len(bias) == len(input_bias) == 3 * weight.shape[1] and valid.shape == (rows, n)
-    fit = fit and first.shape == (n,)
-    on_cpu = projected.device.type == "cpu"  # elsewhere PyTorch looks at the range itself
-    if not fit or (on_cpu and not ((first >= 0) & (first + length <= rows)).all()):
-        raise ValueError(f"windows of {length} rows do not fit {tuple(projected.shape)}, or weights or masks do not")
-    if on_cpu and projected.dtype == weight.dtype == torch.float32 and weight.shape[1] % (2 * LANES) == 0:
-        given = projected.contiguous(), valid.float().contiguous(), first.long().contiguous(), length
-        states = GRULayer.apply(*given, input_bias, weight, bias, torch.is_grad_enabled())
-        assert isinstance(states, Tensor)
-        return states
-    return _gru_of_operations(projected, valid, first, length, input_bias, weight, bias)
+    rows, n, inputs = steps.shape
+    hidden = layers[0].weight.shape[1]
+    fit = 0 < length <= rows and valid.shape == (rows, n) and (later is None or later.shape == (n,))
+    for i, layer in enumerate(layers):
+        shapes = [(3 * hidden, hidden if i else inputs), (3 * hidden,), (3 * hidden, hidden), (3 * hidden,)]
+        fit = fit and [tensor.shape for tensor in layer] == shapes
+    on_cpu = steps.device.type == "cpu"  # elsewhere PyTorch looks at the range itself
+    if fit and on_cpu and later is not None:
+        fit = bool(((later >= 0) & (later + length <= rows)).all())
+    if not fit:
+        raise ValueError(f"windows of {length} rows do not fit {tuple(steps.shape)}, or weights or masks do not")
+    first = torch.zeros(n, dtype=torch.int64, device=steps.device)
+    if on_cpu and steps.dtype == layers[0].weight.dtype == torch.float32 and hidden % (2 * LANES) == 0:
+        weights = [tensor for layer in layers for tensor in layer]
+        return GRU.apply(steps, valid, length, first, later, in_bfloat16, torch.is_grad_enabled(), *weights)  # type: ignore[return-value]
+    projected = _product(steps, layers[0].input_weight, in_bfloat16)
+    state = _gru_of_operations(projected, valid, length, first, layers)
+    with torch.no_grad():
+        return state, None if later is None else _gru_of_operations(projected, valid, length, later, layers)
 
 
-def _gru_of_operations(
-    projected: Tensor, valid: Tensor, first: Tensor, length: int, input_bias: Tensor, weight: Tensor, bias: Tensor
-) -> Tensor:
-    """`gru` of PyTorch's operations alone: for other devices, types of number and sizes."""
-    hidden, each = weight.shape[1], torch.arange(projected.shape[1], device=projected.device)
-    state = projected.new_zeros(projected.shape[1], hidden)
-    states = []
+def _product(x: Tensor, weight: Tensor, in_bfloat16: bool) -> Tensor:
+    return (x.bfloat16() @ weight.bfloat16().t()).float() if in_bfloat16 else x @ weight.t()
+
+
+def _gru_of_operations(projected: Tensor, valid: Tensor, length: int, first: Tensor, layers: Sequence[Layer]) -> Tensor:
+    """The state of one window of `gru`, of PyTorch's operations: for other devices, types of number and sizes."""
+    each = torch.arange(len(first), device=first.device)
+    states = [projected.new_zeros(len(first), layer.weight.shape[1]) for layer in layers]
     for t in range(length):
-        x = projected[first + t, each] + input_bias
-        of_state = torch.addmm(bias, state, weight.t())
-        gates = torch.sigmoid(x[:, : 2 * hidden] + of_state[:, : 2 * hidden])
-        reset, update = gates.chunk(2, -1)
-        candidate = torch.tanh(x[:, 2 * hidden :] + reset * of_state[:, 2 * hidden :])
-        state = valid[first + t, each].unsqueeze(-1) * torch.lerp(candidate, state, update)
-        states.append(state)
-    return torch.stack(states)
+        of_input = projected[first + t, each]
+        for i, (input_weight, input_bias, weight, bias) in enumerate(layers):
+            if i:
+                of_input = states[i - 1] @ input_weight.t()
+            reset_x, update_x, candidate_x = (of_input + input_bias).chunk(3, -1)
+            reset_h, update_h, candidate_h = torch.addmm(bias, states[i], weight.t()).chunk(3, -1)
+            update = torch.sigmoid(update_x + update_h)
+            candidate = torch.tanh(candidate_x + torch.sigmoid(reset_x + reset_h) * candidate_h)
+            states[i] = valid[first + t, each].unsqueeze(-1) * torch.lerp(candidate, states[i], update)
+    return states[-1]
 
 
-class GRULayer(torch.autograd.Function):
-    """`gru` on a CPU, in float32, for hidden states that fill registers."""
+class GRU(torch.autograd.Function):
+    """`gru` on a CPU, in float32, for hidden states that fill registers.
+
+    A layer's trace, (length · n, 4 hidden), has at each step c, r, u and s = W h + b of c. Going back they are
+    overwritten by the gradients of the sums that they are made of: those of V x in the places of c, r and u, those of
+    W h in the places of r, u and s.
+    """
 
     @staticmethod
     def forward(
         ctx,
-        projected: Tensor,
+        steps: Tensor,
         valid: Tensor,
-        first: Tensor,
         length: int,
-        input_bias: Tensor,
-        weight: Tensor,
-        bias: Tensor,
-        with_grad: bool,
-    ) -> Tensor:
-        """See `gru`; `with_grad`: keep what `backward` needs."""
-        n, hidden = projected.shape[1], weight.shape[1]
-        kept = length if with_grad else 1
-        gates = valid.new_empty(kept, n, 3 * hidden)  # r, u and the recurrent product's share of c
-        candidates = valid.new_empty(kept, n, hidden)
-        states = valid.new_empty(length + 1, n, hidden)
-        states[0] = 0.0
-        both = torch.cat([input_bias[: 2 * hidden] + bias[: 2 * hidden], input_bias[2 * hidden :], bias[2 * hidden :]])
-        # Columns of r, u and c that one step of the kernel's product makes, side by side.
-        packed = weight.view(3, -1, LANES, hidden).permute(1, 3, 0, 2).contiguous()
-        row_loop(
-            _forwards, n, hidden, length, kept, valid, first, projected, both, packed, gates, candidates, states
-        )  # fmt: skip
-        if with_grad:
-            ctx.save_for_backward(projected, valid, first, gates, candidates, states, weight)
-        return states[1:]
+        first: Tensor,
+        later: Tensor | None,
+        in_bfloat16: bool,
+        keeps: bool,
+        *weights: Tensor,
+    ) -> tuple[Tensor, Tensor | None]:
+        """See `gru`; `first`: zeros, `keeps`: what `backward` needs."""
+        n, hidden, layers = len(first), weights[2].shape[1], _layers(weights)
+        valid = valid.float().contiguous()
+        x = steps.flatten(0, 1)
+        if in_bfloat16:
+            x = x.bfloat16()
+        projected = (x @ weights[0].to(x.dtype).t()).float()
+        packed = [
+            (_biases(layer), _by_gates(_candidate_first(layer.input_weight)) if i else 0, _by_gates(layer.weight))
+            for i, layer in enumerate(layers)
+        ]
+
+        def run(first: Tensor, kept: int) -> list[tuple[Tensor, Tensor]]:
+            made = [
+                (valid.new_empty(max(kept, 1) * n, 4 * hidden), valid.new_empty((kept + 1) * n, hidden)) for _ in layers
+            ]
+            for _, states in made:
+                states[:n] = 0.0
+            each = [number for pack, pair in zip(packed, made, strict=True) for number in (*pack, *pair)]
+            row_loop(_forwards, n, hidden, length, len(layers), int(kept > 0), valid, first, projected, *each)
+            return made
+
+        kept = run(first, length if keeps else 0)
+        if keeps:
+            ctx.save_for_backward(valid, x, *weights)
+            ctx.kept, ctx.shape = kept, steps.shape
+        arrived = None if later is None else run(later.long().contiguous(), 0)[-1][1]
+        if arrived is not None:
+            ctx.mark_non_differentiable(arrived)
+        return kept[-1][1][-n:].clone(), arrived
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor):
-        projected, valid, first, gates, candidates, states, weight = ctx.saved_tensors
-        arrived = grads[0].contiguous()
-        length, n, hidden = arrived.shape
-        grad = torch.empty_like(projected)
-        spare = len(projected) - length  # rows at either end that are not in every window
-        for outside in (grad[:spare], grad[length:]):
-            outside.zero_()
-        recurrent = grad.new_empty(length, n, 3 * hidden)  # the gradient of the recurrent products
-        back = grad.new_zeros(n, hidden)  # what arrives from the step behind
-        of_biases = grad.new_zeros(blocks_of(n), 4 * hidden)
-        packed = weight.view(3 * hidden, -1, 2 * LANES).transpose(0, 1).contiguous()
-        row_loop(
-            _backwards, n, hidden, length, valid, first, gates, candidates, states, packed, arrived, back, grad,
-            recurrent, of_biases,
-        )  # fmt: skip
-        of_weight = recurrent[1:].view(-1, 3 * hidden).t() @ states[1:-1].view(-1, hidden)
-        of_both, of_input, of_recurrent = of_biases.sum(0).split([2 * hidden, hidden, hidden])
-        of_input, of_recurrent = torch.cat([of_both, of_input]), torch.cat([of_both, of_recurrent])
-        return grad, None, None, None, of_input, of_weight, of_recurrent, None
+        if ctx.kept is None:
+            raise RuntimeError("gru: the gradient can be had once, since going back overwrites what it needs")
+        kept, ctx.kept = ctx.kept, None
+        valid, x, *weights = ctx.saved_tensors
+        rows, n, inputs = ctx.shape
+        hidden, layers = weights[2].shape[1], _layers(weights)
+        length = len(kept[0][0]) // n
+        back = valid.new_zeros(len(layers), n, hidden)  # what arrives from behind
+        back[-1] = grads[0]
+        of_biases = valid.new_zeros(len(layers), blocks_of(n), 4 * hidden)
+        given: list[Tensor | int] = []
+        for i, layer in enumerate(layers):
+            below = _by_inputs(_candidate_first(layer.input_weight)) if i else 0
+            given += [below, _by_inputs(layer.weight), *kept[i], back[i], of_biases[i]]
+        row_loop(_backwards, n, hidden, length, len(layers), valid, *given)
+        found: list[Tensor | None] = []
+        of_inputs = x[: length * n]
+        for (trace, states), (of_candidate, of_gates, of_share) in zip(
+            kept, (each.sum(0).split([hidden, 2 * hidden, hidden]) for each in of_biases), strict=True
+        ):
+            of_sums = trace[:, : 3 * hidden].to(of_inputs.dtype)
+            candidate, gates = (of_inputs.t() @ of_sums).t().split([hidden, 2 * hidden])
+            of_weight = trace[n:, hidden : 4 * hidden].t() @ states[n:-n]
+            found += [torch.cat([gates, candidate]).float(), torch.cat([of_gates, of_candidate])]
+            found += [of_weight, torch.cat([of_gates, of_share])]
+            of_inputs = states[n:]
+        of_steps = None
+        if ctx.needs_input_grad[0]:
+            of_steps = valid.new_empty(rows * n, inputs)
+            of_sums = kept[0][0][:, : 3 * hidden].to(x.dtype)
+            of_steps[: length * n] = of_sums @ _candidate_first(weights[0]).to(x.dtype)
+            of_steps[length * n :] = 0.0
+            of_steps = of_steps.view(rows, n, inputs)
+        return of_steps, None, None, None, None, None, None, *found
+
+
+def _layers(weights: Sequence[Tensor]) -> list[Layer]:
+    return [Layer(*weights[k : k + 4]) for k in range(0, len(weights), 4)]
+
+
+def _biases(layer: Layer) -> Tensor:
+    """(4 hidden,) of a trace's sums."""
+    hidden = layer.weight.shape[1]
+    x, h = (bias.split([2 * hidden, hidden]) for bias in (layer.input_bias, layer.bias))
+    return torch.cat([x[1], x[0] + h[0], h[1]])
+
+
+def _candidate_first(weight: Tensor) -> Tensor:
+    """Rows of c, r and u in place of r, u and c."""
+    return weight.roll(len(weight) // 3, 0)
+
+
+def _by_gates(weight: Tensor) -> Tensor:
+    """(3 hidden, inputs) as `_add_to_gates` reads it: in a panel a register's rows of each of the three parts."""
+    return weight.view(3, -1, LANES, weight.shape[1]).permute(1, 3, 0, 2).contiguous()
+
+
+def _by_inputs(weight: Tensor) -> Tensor:
+    """(3 hidden, inputs) as `_add_to_inputs` reads it: in a panel two registers' columns."""
+    return weight.view(len(weight), -1, 2 * LANES).transpose(0, 1).contiguous()
 
 
 _f4, _u8 = np.float32, np.uint64
-_0, _1, _2, _3, _4 = _u8(0), _u8(1), _u8(2), _u8(3), _u8(4)
-_lanes, _rows = _u8(LANES), _u8(ROWS)
+_0, _1, _2, _3, _4, _5, _6 = map(_u8, range(7))
+_lanes, _rows, _block = _u8(LANES), _u8(ROWS), _u8(BLOCK)
 _OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy"}
 
-_gates_of_rows, _gates_of_row = (product(rows, 3, adds=False) for rows in (ROWS, 1))
-_back_of_rows, _back_of_row = (product(rows, 2, adds=True) for rows in (ROWS, 1))
+_add_to_gates, _add_to_inputs = product(3), product(2)
 
 
 @njit(**_OPTIONS)
@@ -156,104 +244,99 @@ def _sigmoid(x):
 
 @cfunc(ROW_LOOP, **_OPTIONS)
 def _forwards(given):
-    n, hidden, length, kept = given[1], given[2], given[3], given[4]
-    valid, first, projected = floats(given[5]), integers(given[6]), floats(given[7])
-    bias, weight = floats(given[8]), floats(given[9])
-    gates, candidates, states = floats(given[10]), floats(given[11]), floats(given[12])
-    width = _3 * hidden
+    n, hidden, length, layers, keeps = given[1], given[2], given[3], given[4], given[5]
+    valid, first, projected = floats(given[6]), integers(given[7]), floats(given[8])
+    width, kept = _4 * hidden, n * keeps  # rows from one step to the next, of which none or all are kept
     begin = take(given)
     while begin < n:
-        end = min(begin + _u8(BLOCK), n)
-        for step in range(length):
-            t = _u8(step)
-            at = n * (t % kept)
-            if t == _0:  # the state is 0
-                for k in range(width * (at + begin), width * (at + end), _lanes):
-                    store(gates, k, splat(_f4(0)))
-            else:
-                j = _0
-                while j < hidden:
-                    i = begin
-                    while i < end:
-                        h, g = hidden * (n * t + i), width * (at + i) + j
-                        if i + _rows <= end:
-                            _gates_of_rows(states, h, hidden, weight, width * j, hidden, gates, g, width, hidden)
-                            i += _rows
-                        else:
-                            _gates_of_row(states, h, hidden, weight, width * j, hidden, gates, g, width, hidden)
-                            i += _1
-                    j += _lanes
-            for i in range(begin, end):
-                row = n * (_u8(first[i]) + t) + i
-                keep = splat(valid[row])
-                j = _0
-                while j < hidden:
-                    x, g, h = width * row + j, width * (at + i) + j, hidden * (n * t + i) + j
-                    reset = _sigmoid(load(projected, x) + load(gates, g) + load(bias, j))
-                    update = _sigmoid(load(projected, x + hidden) + load(gates, g + hidden) + load(bias, hidden + j))
-                    share = load(gates, g + _2 * hidden) + load(bias, width + j)
-                    of_input = load(projected, x + _2 * hidden) + load(bias, _2 * hidden + j)
-                    candidate = _tanh(of_input + reset * share)
-                    store(gates, g, reset)
-                    store(gates, g + hidden, update)
-                    store(gates, g + _2 * hidden, share)
-                    store(candidates, hidden * (at + i) + j, candidate)
-                    store(states, h + hidden * n, keep * (candidate + update * (load(states, h) - candidate)))
-                    j += _lanes
+        rows = min(_block, n - begin)
+        for t in range(length):
+            at, before = width * (kept * t + begin), hidden * (kept * t + begin)
+            after = before + hidden * kept
+            for layer in range(layers):
+                k = _u8(9) + _5 * layer
+                biases, trace, states = floats(given[k]), floats(given[k + _3]), floats(given[k + _4])
+                for i in range(rows):  # in each place what is there of the sums
+                    to = at + width * i
+                    for j in range(_0, _4 * hidden, _lanes):
+                        store(trace, to + j, load(biases, j))
+                    if layer == _0:
+                        x = _3 * hidden * (n * (_u8(first[begin + i]) + t) + begin + i)
+                        for j in range(_0, hidden, _lanes):
+                            c, r, u = to + j, to + hidden + j, to + _2 * hidden + j
+                            store(trace, r, load(trace, r) + load(projected, x + j))
+                            store(trace, u, load(trace, u) + load(projected, x + hidden + j))
+                            store(trace, c, load(trace, c) + load(projected, x + _2 * hidden + j))
+                if layer > _0:
+                    below, weight = floats(given[k - _1]), floats(given[k + _1])
+                    _add_to_gates(
+                        rows, below, after, hidden, weight, hidden, hidden // _lanes, trace, at, width, hidden, _lanes
+                    )
+                if t > _0:  # before, the state is 0
+                    weight, to = floats(given[k + _2]), at + hidden
+                    _add_to_gates(
+                        rows, states, before, hidden, weight, hidden, hidden // _lanes, trace, to, width, hidden, _lanes
+                    )
+                for i in range(rows):
+                    keep = splat(valid[n * (_u8(first[begin + i]) + t) + begin + i])
+                    for j in range(_0, hidden, _lanes):
+                        c, h = at + width * i + j, hidden * i + j
+                        r, u, s = c + hidden, c + _2 * hidden, c + _3 * hidden
+                        reset, update = _sigmoid(load(trace, r)), _sigmoid(load(trace, u))
+                        candidate = _tanh(load(trace, c) + reset * load(trace, s))
+                        store(trace, c, candidate)
+                        store(trace, r, reset)
+                        store(trace, u, update)
+                        state = candidate + update * (load(states, before + h) - candidate)
+                        store(states, after + h, keep * state)
         begin = take(given)
 
 
 @cfunc(ROW_LOOP, **_OPTIONS)
 def _backwards(given):
-    n, hidden, length = given[1], given[2], given[3]
-    valid, first, gates, candidates = floats(given[4]), integers(given[5]), floats(given[6]), floats(given[7])
-    states, weight, arrived, back = floats(given[8]), floats(given[9]), floats(given[10]), floats(given[11])
-    grad, recurrent, of_biases = floats(given[12]), floats(given[13]), floats(given[14])
-    width, one = _3 * hidden, splat(_f4(1))
+    n, hidden, length, layers, valid = given[1], given[2], given[3], given[4], floats(given[5])
+    width, one, pair = _4 * hidden, splat(_f4(1)), _2 * _lanes
+    panels = hidden // pair
     begin = take(given)
     while begin < n:
-        end = min(begin + _u8(BLOCK), n)
-        total = _4 * hidden * (begin // _u8(BLOCK))
+        rows, here = min(_block, n - begin), hidden * begin
         for step in range(length):
-            t = length - _1 - _u8(step)
-            for i in range(begin, end):
-                row = n * (_u8(first[i]) + t) + i
-                keep = splat(valid[row])
-                j = _0
-                while j < hidden:
-                    to, b, h = width * row + j, hidden * i + j, hidden * (n * t + i) + j
-                    r = width * (n * t + i) + j
-                    u, p = r + hidden, r + _2 * hidden
-                    reset, update, candidate = load(gates, r), load(gates, u), load(candidates, h)
-                    of_state = keep * (load(back, b) + load(arrived, h))
-                    of_candidate = of_state * (one - update) * (one - candidate * candidate)
-                    of_update = of_state * (load(states, h) - candidate) * update * (one - update)
-                    of_share = of_candidate * reset
-                    of_reset = of_share * load(gates, p) * (one - reset)
-                    store(back, b, of_state * update)
-                    store(grad, to, of_reset)
-                    store(grad, to + hidden, of_update)
-                    store(grad, to + _2 * hidden, of_candidate)
-                    store(recurrent, r, of_reset)
-                    store(recurrent, u, of_update)
-                    store(recurrent, p, of_share)
-                    s = total + j
-                    store(of_biases, s, load(of_biases, s) + of_reset)
-                    store(of_biases, s + hidden, load(of_biases, s + hidden) + of_update)
-                    store(of_biases, s + _2 * hidden, load(of_biases, s + _2 * hidden) + of_candidate)
-                    store(of_biases, s + width, load(of_biases, s + width) + of_share)
-                    j += _lanes
-            if t > _0:
-                j = _0
-                while j < hidden:
-                    i = begin
-                    while i < end:
-                        r, b = width * (n * t + i), hidden * i + j
-                        if i + _rows <= end:
-                            _back_of_rows(recurrent, r, width, weight, width * j, width, back, b, hidden, _lanes)
-                            i += _rows
-                        else:
-                            _back_of_row(recurrent, r, width, weight, width * j, width, back, b, hidden, _lanes)
-                            i += _1
-                    j += _2 * _lanes
+            t = length - _1 - step
+            at = width * (n * t + begin)
+            for down in range(layers):
+                layer = layers - _1 - down
+                k = _6 + _6 * layer
+                trace, states, back = floats(given[k + _2]), floats(given[k + _3]), floats(given[k + _4])
+                of_biases, total = floats(given[k + _5]), _4 * hidden * (begin // _block)
+                for i in range(rows):
+                    keep = splat(valid[n * t + begin + i])
+                    for j in range(_0, hidden, _lanes):
+                        c, b = at + width * i + j, here + hidden * i + j
+                        r, u, s = c + hidden, c + _2 * hidden, c + _3 * hidden
+                        candidate, reset, update = load(trace, c), load(trace, r), load(trace, u)
+                        of_state = keep * load(back, b)
+                        of_candidate = of_state * (one - update) * (one - candidate * candidate)
+                        of_update = of_state * (load(states, hidden * n * t + b) - candidate) * update * (one - update)
+                        of_share = of_candidate * reset
+                        of_reset = of_share * load(trace, s) * (one - reset)
+                        store(back, b, of_state * update)
+                        store(trace, c, of_candidate)
+                        store(trace, r, of_reset)
+                        store(trace, u, of_update)
+                        store(trace, s, of_share)
+                        q = total + j
+                        store(of_biases, q, load(of_biases, q) + of_candidate)
+                        store(of_biases, q + hidden, load(of_biases, q + hidden) + of_reset)
+                        store(of_biases, q + _2 * hidden, load(of_biases, q + _2 * hidden) + of_update)
+                        store(of_biases, q + _3 * hidden, load(of_biases, q + _3 * hidden) + of_share)
+                if t > _0:
+                    weight = floats(given[k + _1])
+                    _add_to_inputs(
+                        rows, trace, at + hidden, width, weight, _3 * hidden, panels, back, here, hidden, _lanes, pair
+                    )
+                if layer > _0:
+                    weight, below = floats(given[k]), floats(given[k - _2])
+                    _add_to_inputs(
+                        rows, trace, at, width, weight, _3 * hidden, panels, below, here, hidden, _lanes, pair
+                    )
         begin = take(given)

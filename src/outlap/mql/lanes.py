@@ -10,7 +10,9 @@ import operator
 from typing import Any
 
 import llvmlite.binding as llvm
+import numpy as np
 from llvmlite import ir
+from numba import njit
 from numba.core import cgutils, config, types
 from numba.core.datamodel.models import PrimitiveModel
 from numba.extending import intrinsic, overload, register_model
@@ -118,12 +120,34 @@ for _function, _instruction in (
     _operation(_function, _instruction)
 
 
-def product(rows: int, registers: int, *, adds: bool) -> Any:
-    """A kernel's function for C = A B, or C += A B, of so many rows and `registers` · LANES columns.
+def product(registers: int) -> Any:
+    """A kernel's function for C += A B, whose sums stay in so many registers of each of some rows.
 
-    Called with (a, its first number, its row's length, b, its first number, its height, c, its first number, its row's
-    length, from one register's columns to the next). B lies row by row, without gaps.
+    Called with (rows; a, its first number, its row's length; b, its height, its panels; c, its first number, its row's
+    length, from one register's columns to the next, from one panel's to the next). A panel of B has the columns of
+    `registers` registers side by side, row by row; panels lie one behind the other.
     """
+    of_rows, of_row = (_tile(rows, registers) for rows in (ROWS, 1))
+    together, one, size = np.uint64(ROWS), np.uint64(1), np.uint64(registers * LANES)
+
+    @njit(error_model="numpy")
+    def multiply(rows, a, a_first, a_row, b, height, panels, c, c_first, c_row, c_apart, c_next):
+        for panel in range(panels):
+            i, at = np.uint64(0), size * height * panel
+            while i < rows:
+                here, to = a_first + a_row * i, c_first + c_row * i + c_next * panel
+                if i + together <= rows:
+                    of_rows(a, here, a_row, b, at, height, c, to, c_row, c_apart)
+                    i += together
+                else:
+                    of_row(a, here, a_row, b, at, height, c, to, c_row, c_apart)
+                    i += one
+
+    return multiply
+
+
+def _tile(rows: int, registers: int) -> Any:
+    """C += A B of so many rows and registers' columns, whose sums stay in registers."""
 
     def compute(typingctx, a, a_first, a_row, b, b_first, height, c, c_first, c_row, c_apart):
         def code(context, builder, signature, given):
@@ -145,10 +169,7 @@ def product(rows: int, registers: int, *, adds: bool) -> Any:
             for row in range(rows):
                 at = builder.add(c_first, builder.mul(c_row, _INDEX(row)))
                 for total in sums[row]:
-                    value = builder.load(total)
-                    if adds:
-                        value = builder.fadd(value, _read(builder, c, at))
-                    _write(builder, value, c, at)
+                    _write(builder, builder.fadd(builder.load(total), _read(builder, c, at)), c, at)
                     at = builder.add(at, c_apart)
 
         index = types.uint64

@@ -106,8 +106,8 @@ def td3_update(
         loss = loss + anchor_weight * distance
         record["anchor_distance"] = distance.detach()
 
-    policy.critic_optimizer.zero_grad()
-    policy.actor_optimizer.zero_grad()
+    for parameter in policy.adapted_parameters():
+        parameter.grad = None
     loss.backward()
     grad_norm = _step(policy.critic_optimizer, settings.max_grad_norm)
     if update_actor:
@@ -130,7 +130,10 @@ def td3_update(
 
 def _step(optimizer: torch.optim.Optimizer, max_norm: float) -> Tensor:
     """Change the parameters by their gradients, which are clipped together; their norm before."""
-    norm = nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_norm)
+    parameters = optimizer.param_groups[0]["params"]
+    norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    if norm.device.type != "cpu" or norm > max_norm:  # elsewhere it is not worth waiting for
+        nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
     optimizer.step()
     return norm
 
@@ -141,11 +144,8 @@ def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:
         zero = torch.zeros(len(batch.action), policy.context.hidden, device=policy.device)
         return zero, zero
     steps, valid = policy.steps(batch.windows)
-    projected = policy.context.project(steps)  # once, for windows that share all rows but the ends
-    departing = policy.context(projected, valid, policy.history)
-    with torch.no_grad():
-        later = torch.as_tensor(batch.steps, device=policy.device)
-        arriving = policy.context(projected, valid, policy.history, first=later)
+    later = torch.as_tensor(batch.steps, device=policy.device)
+    departing, arriving = policy.context(steps, valid, policy.history, later)
     return departing, arriving
 
 

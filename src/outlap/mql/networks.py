@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from outlap.mql.gru import gru
+from outlap.mql.gru import Layer, gru
 
 PREVIOUS_REWARD = "previous_reward"  # the observation term that the context takes the reward from
 
@@ -19,8 +19,7 @@ PREVIOUS_REWARD = "previous_reward"  # the observation term that the context tak
 class ContextEncoder(nn.Module):
     """A GRU over a window of (action, reward, observation): what the last steps tell of the task.
 
-    Before an episode's start the hidden state stays 0. Written out, and not `nn.GRU`, so that the projection of
-    the inputs, most of the work, is made once for windows that overlap.
+    Before an episode's start the hidden state stays 0.
     """
 
     def __init__(self, inputs: int, hidden: int, layers: int) -> None:
@@ -32,38 +31,20 @@ class ContextEncoder(nn.Module):
         for parameter in self.parameters():
             nn.init.uniform_(parameter, -1.0 / math.sqrt(hidden), 1.0 / math.sqrt(hidden))
 
-    def project(self, steps: Tensor) -> Tensor:
-        """The first layer's share of the inputs, without its bias: (rows, n, inputs) → (rows, n, 3 hidden)."""
-        return self._product(self.inputs[0], steps)
-
-    def _product(self, layer: nn.Module, x: Tensor) -> Tensor:
-        assert isinstance(layer, nn.Linear)
-        if not self.in_bfloat16:
-            return functional.linear(x, layer.weight)
-        return functional.linear(x.bfloat16(), layer.weight.bfloat16()).float()
-
-    def forward(self, projected: Tensor, valid: Tensor, length: int, first: Tensor | None = None) -> Tensor:
-        """The context z (n, hidden) after the last step of each window.
+    def forward(
+        self, steps: Tensor, valid: Tensor, length: int, later: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """The context z (n, hidden) after a window's last step, and, without gradient, that of a later window.
 
         Args:
-            projected: (rows, n, 3 hidden) from `project`.
+            steps: (rows, n, inputs).
             valid: (rows, n), 0 before the episode's start and 1 after.
-            length: rows of a window.
-            first: int64 (n,) the row where each window begins; by default 0.
+            length: rows of a window, for z the first.
+            later: int64 (n,) the row where the later window begins; by default there is none.
         """
-        zeros = torch.zeros(projected.shape[1], dtype=torch.int64, device=projected.device)
-        first = zeros if first is None else first
-        steps = projected
-        for layer, (inputs, recurrent) in enumerate(zip(self.inputs, self.recurrent, strict=True)):
-            assert isinstance(inputs, nn.Linear)
-            assert isinstance(recurrent, nn.Linear)
-            if layer:
-                steps = self._product(inputs, steps)
-            if layer == 1:  # from here on rows are those of the windows
-                rows = first + torch.arange(length, device=first.device).unsqueeze(-1)
-                valid, first = valid[rows, torch.arange(len(first), device=first.device)], zeros
-            steps = gru(steps, valid, first, length, inputs.bias, recurrent.weight, recurrent.bias)
-        return steps[-1]
+        pairs = zip(self.inputs, self.recurrent, strict=True)
+        layers = [Layer(x.weight, x.bias, h.weight, h.bias) for x, h in pairs]  # type: ignore[arg-type]
+        return gru(steps, valid, length, layers, later, in_bfloat16=self.in_bfloat16)
 
 
 class ObservationEncoder(nn.Module):

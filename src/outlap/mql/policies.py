@@ -106,7 +106,7 @@ class MQLPolicy(BasePolicy):
         if not self.uses_context:
             return torch.zeros(windows.valid.shape[1], self.context.hidden, device=self.device)
         steps, valid = self.steps(windows)
-        return self.context(self.context.project(steps), valid, len(steps))
+        return self.context(steps, valid, len(steps))[0]
 
     def act(self, observation: Mapping[str, np.ndarray], windows: Windows) -> np.ndarray:
         """Actions in [-1, 1], (n, actions), without noise."""
