@@ -664,8 +664,11 @@ def test_saving_that_fails_leaves_the_file_that_was_there(tmp_path: Path, monkey
 
 @pytest.mark.parametrize(
     "broken",
-    ["missing", "empty", "not an archive", "cut short", "lacks a column", "other numbers", "other axes", "pickled"],
-)
+    [
+        "missing", "empty", "not an archive", "of a later version", "cut short", "lacks a column", "other numbers",
+        "other axes", "pickled",
+    ],
+)  # fmt: skip
 def test_what_is_no_replay_is_an_error_that_names_the_file(broken: str, tmp_path: Path) -> None:
     path = by_hand().save(tmp_path / "replay.npz")
     whole = path.read_bytes()
@@ -677,6 +680,9 @@ def test_what_is_no_replay_is_an_error_that_names_the_file(broken: str, tmp_path
         path.write_bytes(b"")
     elif broken == "not an archive":
         path.write_text("a few words")
+    elif broken == "of a later version":
+        needed = whole.index(b"PK\x01\x02") + 6  # of the first member, in the archive's directory
+        path.write_bytes(whole[:needed] + b"\x5d" + whole[needed + 1 :])
     elif broken == "cut short":
         path.write_bytes(whole[: len(whole) // 2])
     elif broken == "lacks a column":
