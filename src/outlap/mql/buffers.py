@@ -269,12 +269,13 @@ class HistoryBuffer:
         """
         rows, steps, reward = self._positions(serial, history, n_steps, gamma)
         first, last = rows[history - 1], rows[-1]
+        seen = gather(self.observation, np.concatenate([first, last]))
         return Batch(
             serial=np.asarray(serial),
             task=self.task[first],
             windows=self._read(rows, terms),
-            observation=gather(self.observation, first),
-            next_observation=gather(self.observation, last),
+            observation={name: term[: len(first)] for name, term in seen.items()},
+            next_observation={name: term[len(first) :] for name, term in seen.items()},
             action=self.action[rows[history]],
             reward=reward,
             discount=np.where(self.terminated[last], 0.0, gamma**steps).astype(np.float32),
