@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -87,14 +88,15 @@ def plain_losses(p: MQLPolicy, batch, n_steps: int):
 
 @pytest.mark.parametrize("n_steps", [1, 3])
 @pytest.mark.parametrize("preset", ["paper", "fast"])
-def test_an_update_is_a_plain_td3_step_of_both_losses(preset: str, n_steps: int) -> None:
-    batch = replay(n_steps)
+@pytest.mark.parametrize("max_grad_norm", [0.01, 1e9])
+def test_an_update_is_a_plain_td3_step_of_both_losses(preset: str, n_steps: int, max_grad_norm: float) -> None:
+    batch, settings = replay(n_steps), replace(STILL, max_grad_norm=max_grad_norm)
     weights = torch.linspace(0.1, 3.0, 64)
     ours = policy(preset)
     theirs = copy.deepcopy(ours)
     for each in (ours, theirs):
         use_plain_gradient_descent(each)
-    record = td3_update(ours, batch, STILL, torch.Generator(), update_actor=True, weights=weights)
+    record = td3_update(ours, batch, settings, torch.Generator(), update_actor=True, weights=weights)
 
     each, value = plain_losses(theirs, batch, n_steps)
     critic_loss, actor_loss = (weights * each).mean(), -(weights * value).mean()
@@ -117,8 +119,8 @@ def test_an_update_is_a_plain_td3_step_of_both_losses(preset: str, n_steps: int)
         parameter.grad = gradient
     for gradient in (*of_critic[-len(context) :], *of_actor[len(seen) : len(both)]):  # both losses reach the context
         assert gradient.abs().max() > 0
-    torch.nn.utils.clip_grad_norm_([*heads, *both], STILL.max_grad_norm)
-    torch.nn.utils.clip_grad_norm_(actors, STILL.max_grad_norm)
+    torch.nn.utils.clip_grad_norm_([*heads, *both], max_grad_norm)
+    torch.nn.utils.clip_grad_norm_(actors, max_grad_norm)
     for mine, other in zip(ours.adapted_parameters(), theirs.adapted_parameters(), strict=True):
         assert mine.grad is not None
         assert other.grad is not None

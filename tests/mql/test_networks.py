@@ -103,12 +103,47 @@ def test_the_kernels_compute_every_window_alike_wherever_it_is_in_a_batch() -> N
         torch.testing.assert_close(alone[0], together[i], atol=0.0, rtol=0.0)
 
 
-def test_a_gradient_that_is_wanted_twice_is_refused() -> None:
-    steps = torch.randn(3, 5, 4, requires_grad=True)
-    z, _ = gru(steps, torch.ones(3, 5), 3, layers_of(1, 4, 2 * LANES))
-    z.sum().backward(retain_graph=True)
-    with pytest.raises(RuntimeError, match="once"):
-        z.sum().backward()
+def test_gradients_can_be_had_again_and_in_any_order() -> None:
+    torch.manual_seed(6)
+    layers, valid = layers_of(2, 4, 2 * LANES), torch.ones(3, 5)
+    parameters = [parameter for layer in layers for parameter in layer]
+    one, other = (gru(torch.randn(3, 5, 4), valid, 3, layers)[0].sum() for _ in range(2))
+    first = torch.autograd.grad(one, parameters, retain_graph=True)
+    torch.autograd.grad(other, parameters)
+    for got, want in zip(torch.autograd.grad(one, parameters), first, strict=True):
+        torch.testing.assert_close(got, want, atol=0.0, rtol=0.0)
+
+
+def test_the_kernels_take_any_layout_and_any_number_of_windows() -> None:
+    torch.manual_seed(7)
+    hidden, n = 2 * LANES, 5
+    layers = layers_of(2, 4, hidden)
+    steps, valid, later = (
+        torch.randn(n, 6, 4).transpose(0, 1),
+        torch.rand(n, 6).t() < 0.7,
+        torch.tensor([0, 1, 1, 0, 1]),
+    )
+    found = gru(steps, valid, 5, layers, later.int())
+    expected = gru(steps.contiguous(), valid.float().contiguous(), 5, layers, later)
+    torch.testing.assert_close(found, expected, atol=0.0, rtol=0.0)
+    none, none_later = gru(steps[:, :0], valid[:, :0], 5, layers, later[:0])
+    assert none_later is not None
+    assert none.shape == none_later.shape == (0, hidden)
+    assert not any(grad.any() for grad in torch.autograd.grad(none.sum(), layers[0]))
+
+
+@pytest.mark.parametrize("half", range(8))
+def test_weights_in_half_precision_are_not_misread(half: int) -> None:
+    torch.manual_seed(8)
+    weights = [parameter.detach() for layer in layers_of(2, 4, 2 * LANES) for parameter in layer]
+    steps, valid = torch.randn(3, 5, 4), torch.ones(3, 5)
+    expected, _ = gru(steps, valid, 3, [Layer(*weights[:4]), Layer(*weights[4:])])
+    weights[half] = weights[half].half()
+    try:
+        found, _ = gru(steps, valid, 3, [Layer(*weights[:4]), Layer(*weights[4:])])
+    except RuntimeError:  # PyTorch multiplies no two types of number
+        return
+    torch.testing.assert_close(found.float(), expected, atol=0.01, rtol=0.0)
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -165,15 +200,16 @@ def test_what_was_before_an_episode_changes_nothing() -> None:
     torch.testing.assert_close(z, encoder(steps[2:], valid[2:], 4)[0])
 
 
-def test_in_bfloat16_the_context_and_its_gradient_are_nearly_the_same() -> None:
+@pytest.mark.parametrize("hidden", [5, 2 * LANES])  # operations of PyTorch, and kernels
+def test_in_bfloat16_the_context_and_its_gradient_are_nearly_the_same(hidden: int) -> None:
     torch.manual_seed(5)
-    encoder = ContextEncoder(200, 32, 2)
-    steps, weight = torch.randn(8, 64, 200), torch.randn(64, 32)
+    encoder = ContextEncoder(200, hidden, 2)
+    steps, weight = torch.randn(8, 64, 200, requires_grad=True), torch.randn(64, hidden)
     found = []
     for encoder.in_bfloat16 in (False, True):
         z, _ = encoder(steps, torch.ones(8, 64), 8)
         assert z.dtype == torch.float32
-        found.append((z, *torch.autograd.grad((z * weight).sum(), list(encoder.parameters()))))
+        found.append((z, *torch.autograd.grad((z * weight).sum(), [steps, *encoder.parameters()])))
     for exact, rounded in zip(*found, strict=True):
         off = (exact - rounded).norm() / exact.norm()
         assert 0.0 < off < 0.02

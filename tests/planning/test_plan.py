@@ -218,15 +218,20 @@ def test_limits_that_make_no_sense_are_refused():
         plan_line(ring(5.0), CAR, "fastest")  # type: ignore[arg-type]
 
 
-def test_a_kept_line_is_the_same_and_a_broken_file_is_planned_anew(tmp_path, monkeypatch):
+def test_a_kept_line_is_the_same_and_a_broken_file_is_planned_anew(tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("OUTLAP_CACHE", str(tmp_path))
     track = ring(4.0)
     first, second = kept_line(track, CAR), kept_line(track, CAR)
     np.testing.assert_array_equal(first.path.points, second.path.points)
     assert (first.lap_time, first.solve_time) == (second.lap_time, second.solve_time), "planned once"
     (file,) = tmp_path.rglob("*.npz")
-    file.write_bytes(file.read_bytes()[:100])
-    assert kept_line(track, CAR).solve_time != first.solve_time
+    assert not caplog.records
+    whole = file.read_bytes()
+    needed = whole.index(b"PK\x01\x02") + 6  # version of ZIP, of the first member in the archive's directory
+    for broken in (whole[:100], whole[:needed] + b"\x5d" + whole[needed + 1 :]):
+        file.write_bytes(broken)
+        assert kept_line(track, CAR).solve_time != first.solve_time
+        assert "is made anew" in caplog.records.pop().message
     assert kept_line(track, replace(CAR, mu=0.5)).lap_time > first.lap_time
     assert len(list(tmp_path.rglob("*.npz"))) == 2
 

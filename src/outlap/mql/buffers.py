@@ -370,7 +370,7 @@ class HistoryBuffer:
                 )
                 buffer._departures.append(recent)
         except Exception as error:  # whatever a broken archive raises
-            raise OutlapError(f"{path}: cannot be read as a replay: {brief(error)}") from None
+            raise OutlapError(f"{path}: cannot be read as a replay: {brief(error)}") from error
         return buffer
 
 

@@ -15,7 +15,7 @@ from numba import cfunc, njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from outlap.mql.lanes import LANES, ROWS, clip, load, product, splat, store
+from outlap.mql.lanes import LANES, clip, load, product, splat, store
 from outlap.mql.torch_threads import BLOCK, ROW_LOOP, blocks_of, floats, integers, row_loop, take
 
 
@@ -42,18 +42,19 @@ def gru(
     r, u = σ(V x + a + W h + b)  ·  c = tanh(V x + a + r (W h + b))  ·  h' = c + u (h - c)
 
     Cho et al. (2014), with the reset gate behind the recurrent product as in cuDNN and `torch.nn.GRU`. Both windows
-    share V x of the first layer, most of the work. Its gradient can be had once: going back overwrites what it needs.
+    share V x of the first layer, most of the work. On a CPU, in float32 and for hidden sizes that are a multiple of
+    2 · LANES, kernels do it; otherwise PyTorch's operations.
 
     Args:
         steps: (rows, n, inputs) x of the first layer; that of the others is the state of the layer before.
         valid: (rows, n), 0 where the states are held at 0.
-        length: rows of a window; the one with a gradient has the first ones.
+        length: rows of a window; the one with a gradient begins at row 0.
         layers: of one hidden size.
         later: int64 (n,) the row where the later window begins; by default there is none.
-        in_bfloat16: round so the factors of the first layer's V x and of its gradients.
+        in_bfloat16: make the first layer's V x, and its gradients, in bfloat16.
 
     Returns:
-        (n, hidden) of the window, and of the later one.
+        (n, hidden) of the window; and of the later one, None where there is none.
 
     Raises ValueError where shapes do not fit, or a window leaves the rows.
     """
@@ -63,27 +64,32 @@ def gru(
     for i, layer in enumerate(layers):
         shapes = [(3 * hidden, hidden if i else inputs), (3 * hidden,), (3 * hidden, hidden), (3 * hidden,)]
         fit = fit and [tensor.shape for tensor in layer] == shapes
-    on_cpu = steps.device.type == "cpu"  # elsewhere PyTorch looks at the range itself
-    if fit and on_cpu and later is not None:
+    on_cpu = steps.device.type == "cpu"
+    if fit and on_cpu and later is not None:  # elsewhere it is not worth waiting for
         fit = bool(((later >= 0) & (later + length <= rows)).all())
     if not fit:
         raise ValueError(f"windows of {length} rows do not fit {tuple(steps.shape)}, or weights or masks do not")
+    weights = [tensor for layer in layers for tensor in layer]
+    if on_cpu and hidden % (2 * LANES) == 0 and all(tensor.dtype == torch.float32 for tensor in (steps, *weights)):
+        keeps = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (steps, *weights))
+        return GRUFunction.apply(steps, valid, length, later, in_bfloat16, keeps, *weights)  # type: ignore[return-value]
+    _, projected = _project(steps, layers[0].input_weight, in_bfloat16)
     first = torch.zeros(n, dtype=torch.int64, device=steps.device)
-    if on_cpu and steps.dtype == layers[0].weight.dtype == torch.float32 and hidden % (2 * LANES) == 0:
-        weights = [tensor for layer in layers for tensor in layer]
-        return GRU.apply(steps, valid, length, first, later, in_bfloat16, torch.is_grad_enabled(), *weights)  # type: ignore[return-value]
-    projected = _product(steps, layers[0].input_weight, in_bfloat16)
     state = _gru_of_operations(projected, valid, length, first, layers)
     with torch.no_grad():
         return state, None if later is None else _gru_of_operations(projected, valid, length, later, layers)
 
 
-def _product(x: Tensor, weight: Tensor, in_bfloat16: bool) -> Tensor:
-    return (x.bfloat16() @ weight.bfloat16().t()).float() if in_bfloat16 else x @ weight.t()
+def _project(x: Tensor, weight: Tensor, in_bfloat16: bool) -> tuple[Tensor, Tensor]:
+    """x as it is multiplied, and V x."""
+    if not in_bfloat16:
+        return x, x @ weight.t()
+    x = x.bfloat16()
+    return x, (x @ weight.bfloat16().t()).float()
 
 
 def _gru_of_operations(projected: Tensor, valid: Tensor, length: int, first: Tensor, layers: Sequence[Layer]) -> Tensor:
-    """The state of one window of `gru`, of PyTorch's operations: for other devices, types of number and sizes."""
+    """The state of the window of `gru` that begins at `first`, of PyTorch's operations."""
     each = torch.arange(len(first), device=first.device)
     states = [projected.new_zeros(len(first), layer.weight.shape[1]) for layer in layers]
     for t in range(length):
@@ -99,12 +105,11 @@ def _gru_of_operations(projected: Tensor, valid: Tensor, length: int, first: Ten
     return states[-1]
 
 
-class GRU(torch.autograd.Function):
-    """`gru` on a CPU, in float32, for hidden states that fill registers.
+class GRUFunction(torch.autograd.Function):
+    """`gru` by kernels.
 
-    A layer's trace, (length · n, 4 hidden), has at each step c, r, u and s = W h + b of c. Going back they are
-    overwritten by the gradients of the sums that they are made of: those of V x in the places of c, r and u, those of
-    W h in the places of r, u and s.
+    A layer's gates, (length · n, 4 hidden), are at each step c, r, u and W h + b of c, in this order. Of what they are
+    made of, the gradients lie in the same order: the first three are those of V x, the last three those of W h.
     """
 
     @staticmethod
@@ -113,25 +118,22 @@ class GRU(torch.autograd.Function):
         steps: Tensor,
         valid: Tensor,
         length: int,
-        first: Tensor,
         later: Tensor | None,
         in_bfloat16: bool,
         keeps: bool,
         *weights: Tensor,
     ) -> tuple[Tensor, Tensor | None]:
-        """See `gru`; `first`: zeros, `keeps`: what `backward` needs."""
-        n, hidden, layers = len(first), weights[2].shape[1], _layers(weights)
+        """See `gru`; `keeps`: what `backward` needs."""
+        n, hidden, layers = steps.shape[1], weights[2].shape[1], _layers(weights)
         valid = valid.float().contiguous()
-        x = steps.flatten(0, 1)
-        if in_bfloat16:
-            x = x.bfloat16()
-        projected = (x @ weights[0].to(x.dtype).t()).float()
+        x, projected = _project(steps.flatten(0, 1), weights[0], in_bfloat16)
         packed = [
-            (_biases(layer), _by_gates(_candidate_first(layer.input_weight)) if i else 0, _by_gates(layer.weight))
+            (_biases(layer), _for_gates(_candidate_first(layer.input_weight)) if i else 0, _for_gates(layer.weight))
             for i, layer in enumerate(layers)
         ]
 
         def run(first: Tensor, kept: int) -> list[tuple[Tensor, Tensor]]:
+            """The gates and states of every layer, at so many steps; at 0 the last ones."""
             made = [
                 (valid.new_empty(max(kept, 1) * n, 4 * hidden), valid.new_empty((kept + 1) * n, hidden)) for _ in layers
             ]
@@ -141,52 +143,50 @@ class GRU(torch.autograd.Function):
             row_loop(_forwards, n, hidden, length, len(layers), int(kept > 0), valid, first, projected, *each)
             return made
 
-        kept = run(first, length if keeps else 0)
+        kept = length if keeps else 0
+        made = run(torch.zeros(n, dtype=torch.int64), kept)
         if keeps:
-            ctx.save_for_backward(valid, x, *weights)
-            ctx.kept, ctx.shape = kept, steps.shape
+            ctx.save_for_backward(valid, x, *weights, *(tensor for pair in made for tensor in pair))
+            ctx.shape, ctx.length = steps.shape, length
         arrived = None if later is None else run(later.long().contiguous(), 0)[-1][1]
         if arrived is not None:
             ctx.mark_non_differentiable(arrived)
-        return kept[-1][1][-n:].clone(), arrived
+        return made[-1][1][kept * n :].clone(), arrived
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads: Tensor):
-        if ctx.kept is None:
-            raise RuntimeError("gru: the gradient can be had once, since going back overwrites what it needs")
-        kept, ctx.kept = ctx.kept, None
-        valid, x, *weights = ctx.saved_tensors
-        rows, n, inputs = ctx.shape
-        hidden, layers = weights[2].shape[1], _layers(weights)
-        length = len(kept[0][0]) // n
-        back = valid.new_zeros(len(layers), n, hidden)  # what arrives from behind
+        valid, x, *rest = ctx.saved_tensors
+        number, length, (rows, n, inputs) = len(rest) // 6, ctx.length, ctx.shape
+        weights, made = rest[: 4 * number], rest[4 * number :]
+        layers, hidden = _layers(weights), weights[2].shape[1]
+        back = valid.new_zeros(number, n, hidden)  # what arrives from behind
         back[-1] = grads[0]
-        of_biases = valid.new_zeros(len(layers), blocks_of(n), 4 * hidden)
+        of_sums = valid.new_empty(number, length * n, 4 * hidden)
+        of_biases = valid.new_zeros(number, blocks_of(n), 4 * hidden)
         given: list[Tensor | int] = []
         for i, layer in enumerate(layers):
-            below = _by_inputs(_candidate_first(layer.input_weight)) if i else 0
-            given += [below, _by_inputs(layer.weight), *kept[i], back[i], of_biases[i]]
-        row_loop(_backwards, n, hidden, length, len(layers), valid, *given)
+            given += [
+                _for_inputs(_candidate_first(layer.input_weight)) if i else 0, _for_inputs(layer.weight),
+                *made[2 * i : 2 * i + 2], of_sums[i], back[i], of_biases[i],
+            ]  # fmt: skip
+        row_loop(_backwards, n, hidden, length, number, valid, *given)
         found: list[Tensor | None] = []
         of_inputs = x[: length * n]
-        for (trace, states), (of_candidate, of_gates, of_share) in zip(
-            kept, (each.sum(0).split([hidden, 2 * hidden, hidden]) for each in of_biases), strict=True
-        ):
-            of_sums = trace[:, : 3 * hidden].to(of_inputs.dtype)
-            candidate, gates = (of_inputs.t() @ of_sums).t().split([hidden, 2 * hidden])
-            of_weight = trace[n:, hidden : 4 * hidden].t() @ states[n:-n]
+        for i, states in enumerate(made[1::2]):
+            of_x, of_h = of_sums[i, :, : 3 * hidden], of_sums[i, n:, hidden:]
+            candidate, gates = (of_inputs.t() @ of_x.to(of_inputs.dtype)).t().split([hidden, 2 * hidden])
+            of_candidate, of_gates, of_share = of_biases[i].sum(0).split([hidden, 2 * hidden, hidden])
             found += [torch.cat([gates, candidate]).float(), torch.cat([of_gates, of_candidate])]
-            found += [of_weight, torch.cat([of_gates, of_share])]
+            found += [of_h.t() @ states[n : length * n], torch.cat([of_gates, of_share])]
             of_inputs = states[n:]
         of_steps = None
         if ctx.needs_input_grad[0]:
-            of_steps = valid.new_empty(rows * n, inputs)
-            of_sums = kept[0][0][:, : 3 * hidden].to(x.dtype)
-            of_steps[: length * n] = of_sums @ _candidate_first(weights[0]).to(x.dtype)
-            of_steps[length * n :] = 0.0
+            of_x = of_sums[0, :, : 3 * hidden].to(x.dtype)
+            of_steps = valid.new_zeros(rows * n, inputs)
+            of_steps[: length * n] = of_x @ _candidate_first(weights[0]).to(x.dtype)
             of_steps = of_steps.view(rows, n, inputs)
-        return of_steps, None, None, None, None, None, None, *found
+        return of_steps, None, None, None, None, None, *found
 
 
 def _layers(weights: Sequence[Tensor]) -> list[Layer]:
@@ -194,7 +194,7 @@ def _layers(weights: Sequence[Tensor]) -> list[Layer]:
 
 
 def _biases(layer: Layer) -> Tensor:
-    """(4 hidden,) of a trace's sums."""
+    """(4 hidden,) of the gates."""
     hidden = layer.weight.shape[1]
     x, h = (bias.split([2 * hidden, hidden]) for bias in (layer.input_bias, layer.bias))
     return torch.cat([x[1], x[0] + h[0], h[1]])
@@ -205,19 +205,19 @@ def _candidate_first(weight: Tensor) -> Tensor:
     return weight.roll(len(weight) // 3, 0)
 
 
-def _by_gates(weight: Tensor) -> Tensor:
+def _for_gates(weight: Tensor) -> Tensor:
     """(3 hidden, inputs) as `_add_to_gates` reads it: in a panel a register's rows of each of the three parts."""
     return weight.view(3, -1, LANES, weight.shape[1]).permute(1, 3, 0, 2).contiguous()
 
 
-def _by_inputs(weight: Tensor) -> Tensor:
+def _for_inputs(weight: Tensor) -> Tensor:
     """(3 hidden, inputs) as `_add_to_inputs` reads it: in a panel two registers' columns."""
     return weight.view(len(weight), -1, 2 * LANES).transpose(0, 1).contiguous()
 
 
 _f4, _u8 = np.float32, np.uint64
-_0, _1, _2, _3, _4, _5, _6 = map(_u8, range(7))
-_lanes, _rows, _block = _u8(LANES), _u8(ROWS), _u8(BLOCK)
+_0, _1, _2, _3, _4, _5, _6, _7 = map(_u8, range(8))
+_lanes, _block = _u8(LANES), _u8(BLOCK)
 _OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy"}
 
 _add_to_gates, _add_to_inputs = product(3), product(2)
@@ -255,38 +255,39 @@ def _forwards(given):
             after = before + hidden * kept
             for layer in range(layers):
                 k = _u8(9) + _5 * layer
-                biases, trace, states = floats(given[k]), floats(given[k + _3]), floats(given[k + _4])
+                # of a layer: biases, V and W packed, gates, states
+                biases, gates, states = floats(given[k]), floats(given[k + _3]), floats(given[k + _4])
                 for i in range(rows):  # in each place what is there of the sums
                     to = at + width * i
                     for j in range(_0, _4 * hidden, _lanes):
-                        store(trace, to + j, load(biases, j))
+                        store(gates, to + j, load(biases, j))
                     if layer == _0:
                         x = _3 * hidden * (n * (_u8(first[begin + i]) + t) + begin + i)
                         for j in range(_0, hidden, _lanes):
                             c, r, u = to + j, to + hidden + j, to + _2 * hidden + j
-                            store(trace, r, load(trace, r) + load(projected, x + j))
-                            store(trace, u, load(trace, u) + load(projected, x + hidden + j))
-                            store(trace, c, load(trace, c) + load(projected, x + _2 * hidden + j))
+                            store(gates, r, load(gates, r) + load(projected, x + j))
+                            store(gates, u, load(gates, u) + load(projected, x + hidden + j))
+                            store(gates, c, load(gates, c) + load(projected, x + _2 * hidden + j))
                 if layer > _0:
                     below, weight = floats(given[k - _1]), floats(given[k + _1])
                     _add_to_gates(
-                        rows, below, after, hidden, weight, hidden, hidden // _lanes, trace, at, width, hidden, _lanes
+                        rows, below, after, hidden, weight, hidden, hidden // _lanes, gates, at, width, hidden, _lanes
                     )
                 if t > _0:  # before, the state is 0
                     weight, to = floats(given[k + _2]), at + hidden
                     _add_to_gates(
-                        rows, states, before, hidden, weight, hidden, hidden // _lanes, trace, to, width, hidden, _lanes
+                        rows, states, before, hidden, weight, hidden, hidden // _lanes, gates, to, width, hidden, _lanes
                     )
                 for i in range(rows):
                     keep = splat(valid[n * (_u8(first[begin + i]) + t) + begin + i])
                     for j in range(_0, hidden, _lanes):
                         c, h = at + width * i + j, hidden * i + j
                         r, u, s = c + hidden, c + _2 * hidden, c + _3 * hidden
-                        reset, update = _sigmoid(load(trace, r)), _sigmoid(load(trace, u))
-                        candidate = _tanh(load(trace, c) + reset * load(trace, s))
-                        store(trace, c, candidate)
-                        store(trace, r, reset)
-                        store(trace, u, update)
+                        reset, update = _sigmoid(load(gates, r)), _sigmoid(load(gates, u))
+                        candidate = _tanh(load(gates, c) + reset * load(gates, s))
+                        store(gates, c, candidate)
+                        store(gates, r, reset)
+                        store(gates, u, update)
                         state = candidate + update * (load(states, before + h) - candidate)
                         store(states, after + h, keep * state)
         begin = take(given)
@@ -305,25 +306,27 @@ def _backwards(given):
             at = width * (n * t + begin)
             for down in range(layers):
                 layer = layers - _1 - down
-                k = _6 + _6 * layer
-                trace, states, back = floats(given[k + _2]), floats(given[k + _3]), floats(given[k + _4])
-                of_biases, total = floats(given[k + _5]), _4 * hidden * (begin // _block)
+                # of a layer: V and W packed, gates, states, then gradients: of the gates' sums, the state, the biases
+                k = _6 + _7 * layer
+                gates, states, of_sums = floats(given[k + _2]), floats(given[k + _3]), floats(given[k + _4])
+                back, of_biases = floats(given[k + _5]), floats(given[k + _6])
+                total = _4 * hidden * (begin // _block)
                 for i in range(rows):
                     keep = splat(valid[n * t + begin + i])
                     for j in range(_0, hidden, _lanes):
                         c, b = at + width * i + j, here + hidden * i + j
                         r, u, s = c + hidden, c + _2 * hidden, c + _3 * hidden
-                        candidate, reset, update = load(trace, c), load(trace, r), load(trace, u)
+                        candidate, reset, update = load(gates, c), load(gates, r), load(gates, u)
                         of_state = keep * load(back, b)
                         of_candidate = of_state * (one - update) * (one - candidate * candidate)
                         of_update = of_state * (load(states, hidden * n * t + b) - candidate) * update * (one - update)
                         of_share = of_candidate * reset
-                        of_reset = of_share * load(trace, s) * (one - reset)
+                        of_reset = of_share * load(gates, s) * (one - reset)
                         store(back, b, of_state * update)
-                        store(trace, c, of_candidate)
-                        store(trace, r, of_reset)
-                        store(trace, u, of_update)
-                        store(trace, s, of_share)
+                        store(of_sums, c, of_candidate)
+                        store(of_sums, r, of_reset)
+                        store(of_sums, u, of_update)
+                        store(of_sums, s, of_share)
                         q = total + j
                         store(of_biases, q, load(of_biases, q) + of_candidate)
                         store(of_biases, q + hidden, load(of_biases, q + hidden) + of_reset)
@@ -332,11 +335,11 @@ def _backwards(given):
                 if t > _0:
                     weight = floats(given[k + _1])
                     _add_to_inputs(
-                        rows, trace, at + hidden, width, weight, _3 * hidden, panels, back, here, hidden, _lanes, pair
+                        rows, of_sums, at + hidden, width, weight, _3 * hidden, panels, back, here, hidden, _lanes, pair
                     )
                 if layer > _0:
-                    weight, below = floats(given[k]), floats(given[k - _2])
+                    weight, below = floats(given[k]), floats(given[k - _2])  # the state's gradient
                     _add_to_inputs(
-                        rows, trace, at, width, weight, _3 * hidden, panels, below, here, hidden, _lanes, pair
+                        rows, of_sums, at, width, weight, _3 * hidden, panels, below, here, hidden, _lanes, pair
                     )
         begin = take(given)

@@ -132,7 +132,7 @@ def _step(optimizer: torch.optim.Optimizer, max_norm: float) -> Tensor:
     """Change the parameters by their gradients, which are clipped together; their norm before."""
     parameters = optimizer.param_groups[0]["params"]
     norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-    if norm.device.type != "cpu" or norm > max_norm:  # elsewhere it is not worth waiting for
+    if norm.device.type != "cpu" or not norm <= max_norm:  # elsewhere it is not worth waiting for; nan goes to all
         nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
     optimizer.step()
     return norm

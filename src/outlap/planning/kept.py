@@ -7,12 +7,12 @@ import io
 import json
 import logging
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, TypeVar
 
 import numpy as np
 
+from outlap.errors import brief
 from outlap.files import atomic_write
 from outlap.planning.limits import Limits
 from outlap.planning.path import Path
@@ -60,8 +60,13 @@ def kept(
     """
     digest = hashlib.sha256(json.dumps([VERSION, key], sort_keys=True).encode()).hexdigest()
     file = cache_root() / "planning" / f"{digest}.npz"
-    with suppress(Exception), np.load(file) as saved:  # whatever a broken archive raises
-        return from_arrays(dict(saved))
+    try:
+        with np.load(file) as saved:
+            return from_arrays(dict(saved))
+    except FileNotFoundError:
+        pass
+    except Exception as error:  # whatever a broken archive raises
+        log.warning("%s: cannot be read (%s) and is made anew", file, brief(error))
     made = make()
     buffer = io.BytesIO()
     np.savez(buffer, **to_arrays(made))  # type: ignore[arg-type]
