@@ -12,11 +12,14 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor, Future, wait
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
-LOOK = 0.1  # [s] between two looks of a worker whether it is to end
+T = TypeVar("T")
+LOOK = 0.1  # [s] between two looks of a worker whether it is to end, and of who waits for one
 SAVING = 60.0  # [s] that a worker has for saving its work before it is ended all the same
 
 
@@ -45,11 +48,51 @@ def ctrl_c_kept_away() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    resource_tracker.ensure_running()  # which starting a process would do, and let Ctrl-C through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # handed down, from their first moment on
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def in_new_process(function: Callable[..., T], *arguments: Any, on_wait: Callable[[], None] = lambda: None) -> T:
+    """What a function returns in a process of its own, which has its own peak of memory, threads and caches.
+
+    Args:
+        function: of a module, and
+        arguments: of it, to be pickled, as what it returns.
+        on_wait: called now and then until it returns.
+
+    Raises what the function raises, and RuntimeError where the process ends without an answer.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_answer, args=(sender, function, arguments), daemon=True)
+    with ctrl_c_kept_away():
+        process.start()
+    sender.close()
+    try:
+        while not receiver.poll(LOOK):
+            on_wait()
+        value, error = receiver.recv()
+    except EOFError:
+        process.join()
+        raise RuntimeError(f"the process of {function.__name__} ended with {process.exitcode}") from None
+    finally:
+        process.kill()
+        process.join()
+    if error is not None:
+        raise error
+    return value
+
+
+def _answer(sender: Connection, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    try:
+        answer = function(*arguments), None
+    except Exception as error:
+        answer = None, error
+    sender.send(answer)
 
 
 class Workers:

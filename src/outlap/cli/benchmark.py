@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import resource
 import time
 from dataclasses import dataclass
@@ -13,6 +12,8 @@ from tyro.conf import FlagCreatePairsOff
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
+from outlap.processes import in_new_process
+from outlap.training.device import check_device
 from outlap.training.run import machine
 
 if TYPE_CHECKING:
@@ -71,8 +72,7 @@ class BenchmarkSimulator:
         with progress_bar("benchmark", len(cases), "cases", self.quiet) as update:
             for cars, beams in cases:
                 # A process of its own each, so that its peak of memory is its own.
-                with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    rows.append(pool.apply(_measure, (self, cars, beams)))
+                rows.append(in_new_process(_measure, self, cars, beams))
                 update(len(rows), f"{cars} car(s), {beams} beams")
         from numba import get_num_threads
 
@@ -197,7 +197,7 @@ class BenchmarkMQL:
     """Measurements of each case; the median is reported, with the fastest and the slowest."""
 
     device: str = "cpu"
-    """Of the networks."""
+    """Of the networks: cpu, cuda, cuda:1, or auto for a GPU if there is one."""
 
     quiet: FlagCreatePairsOff[bool] = False
     """Show no progress."""
@@ -211,12 +211,12 @@ class BenchmarkMQL:
             raise OutlapError("--preset, --beams and --batch go together: give all for one case, or none for the usual")
         if self.updates < 2 or self.repeats < 1:
             raise OutlapError("--updates must be at least 2 and --repeats at least 1")
+        check_device(self.device)
         cases = MQL_CASES if self.preset is None else (given,)
         rows = []
         with progress_bar("benchmark", len(cases), "cases", self.quiet) as update:
             for preset, beams, batch in cases:
-                with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    rows.append(pool.apply(_measure_mql, (self, preset, beams, batch)))
+                rows.append(in_new_process(_measure_mql, self, preset, beams, batch))
                 update(len(rows), f"{preset}, {beams} beams, batch {batch}")
         data = {"rows": rows, "device": self.device, "machine": machine()}
         return CommandResult(data, lambda console: _print_mql(console, rows))
@@ -320,15 +320,8 @@ class BenchmarkRacing:
         if self.worlds < 1 or self.cars < 2 or self.seconds <= 0 or self.repeats < 1:
             raise OutlapError("--cars must be at least 2, --worlds and --repeats at least 1, and --seconds more than 0")
         begun, expected = time.monotonic(), round((1 + self.repeats) * self.seconds)
-        with (
-            progress_bar("benchmark", expected, "seconds", self.quiet) as update,
-            multiprocessing.get_context("spawn").Pool(1) as pool,
-        ):
-            measured = pool.apply_async(_measure_racing, (self,))
-            while not measured.ready():
-                measured.wait(0.5)
-                update(int(time.monotonic() - begun), "")
-            row = measured.get()
+        with progress_bar("benchmark", expected, "seconds", self.quiet) as update:
+            row = in_new_process(_measure_racing, self, on_wait=lambda: update(int(time.monotonic() - begun), ""))
         data = {"rows": [row], "machine": machine()}
         return CommandResult(data, lambda console: _print_racing(console, row))
 

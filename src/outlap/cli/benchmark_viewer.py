@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import tempfile
 import time
@@ -18,6 +17,7 @@ from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.cli.races import check_positive
+from outlap.processes import in_new_process
 from outlap.training.run import machine
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ class BenchmarkViewer:
         row: dict[str, Any] = {}
         with progress_bar("benchmark", len(MEASUREMENTS), "cases", self.quiet) as update:
             for number, measure in enumerate(MEASUREMENTS, start=1):
-                with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    row |= pool.apply(measure, (self,))
+                row |= in_new_process(measure, self)
                 update(number, measure.__name__.removeprefix("_measure_"))
         data = {**row, "machine": machine()}
         return CommandResult(data, lambda console: _print(console, row))

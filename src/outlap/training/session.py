@@ -20,6 +20,7 @@ from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
 from outlap.files import remove_partials
+from outlap.training.device import check_device
 from outlap.training.model_file import load_model
 from outlap.training.run import Run, create_run, save_checkpoint
 
@@ -49,7 +50,7 @@ class TrainingConfig(Config):
     learning_rate: float = Field(default=5e-4, gt=0)
     learning_rate_decay: bool = True  # linearly to zero at total_steps
     gamma: float = Field(default=0.99, gt=0, le=1)
-    device: str = "cpu"
+    device: str = "cpu"  # of PyTorch: cpu, cuda, cuda:1, or auto for a GPU if there is one
     threads: int = Field(default=0, ge=0)  # of PyTorch; 0 = one a core
     checkpoint_every: int = Field(default=250_000, gt=0)  # actions
 
@@ -131,8 +132,8 @@ def train(
         resume: a run to continue from its newest checkpoint; one that is finished is handed back.
         on_progress: called at the end of a rollout, see `TrainingConfig.report_every`.
 
-    Raises OutlapError for a track that cannot be loaded, a folder that holds a run, a network that diverges. A
-    KeyboardInterrupt passes through once a checkpoint is written.
+    Raises OutlapError for a device that is not there, a track that cannot be loaded, a folder that holds a run, a
+    network that diverges. A KeyboardInterrupt passes through once a checkpoint is written.
     """
     if resume is not None and resume.finished:
         return resume
@@ -143,6 +144,7 @@ def train(
     if config.threads:
         torch.set_num_threads(config.threads)
     # Everything that can be wrong with the configuration is found here, before the folder is made.
+    check_device(config.device)
     environment = SB3VecEnv(config.num_envs, **dict(config.env))
     if config.held_out_tracks:
         TaskSplit(environment.env.tasks, TaskSet(load_tracks(config.held_out_tracks)))
