@@ -1,4 +1,4 @@
-"""Milliseconds of a straightforward update of the paper's architecture: a yardstick for `outlap benchmark mql`.
+"""A straightforward update of the paper's architecture, turn about with that of the preset `paper`: a yardstick.
 
 TD3 as it is mostly written, with the networks of the preset `paper`: the critics' step, and at every other update the
 actor's, each with a forward pass and a gradient of its own that trains the context too; `torch.nn.GRU`, two critics one
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import copy
 import time
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -20,8 +21,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from outlap.cli.benchmark import mql_with_replay
+
 SIZES = {"scan": 540, "pose": 3, "vel": 3, "heading": 2}
-ACTIONS, HISTORY, HIDDEN, BATCH, ROWS = 2, 10, 128, 256, 8192
+ACTIONS, HISTORY, HIDDEN, BATCH, ROWS, UPDATES = 2, 10, 128, 256, 8192, 10
 Observation = dict[str, Tensor]
 
 
@@ -115,20 +118,31 @@ class Learner:
         optimizer.step()
 
 
+def milliseconds(updates: Callable[[], None]) -> float:
+    began = time.perf_counter()
+    updates()
+    return (time.perf_counter() - began) * 1e3 / UPDATES
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=9, help="times that ten updates are timed")
-    repeats = parser.parse_args().repeats
+    parser.add_argument("--turns", type=int, default=25, help=f"of {UPDATES} updates each")
+    turns = parser.parse_args().turns
     torch.manual_seed(0)
-    learner, took = Learner(), []
-    for repeat in range(repeats + 1):  # the first is not counted
-        began = time.perf_counter()
-        for i in range(10):
+    learner, model = Learner(), mql_with_replay("paper", SIZES["scan"], BATCH)
+
+    def plain() -> None:
+        for i in range(UPDATES):
             learner.update(update_actor=i % 2 == 1)
-        if repeat:
-            took.append((time.perf_counter() - began) * 100.0)
-    took.sort()
-    print(f"a straightforward update: {took[len(took) // 2]:.1f} ms ({took[0]:.1f} … {took[-1]:.1f})")
+
+    def ours() -> None:
+        model.train(UPDATES, BATCH)
+
+    took = np.array([(milliseconds(plain), milliseconds(ours)) for _ in range(turns + 1)][1:])
+    for name, ms in (("straightforward", took[:, 0]), ("paper", took[:, 1])):
+        print(f"{name:16} {np.median(ms):6.1f} ms   {ms.min():.1f} … {ms.max():.1f}")
+    ratio = took[:, 0] / took[:, 1]
+    print(f"{'ratio':16} {np.median(ratio):6.2f}      {ratio.min():.2f} … {ratio.max():.2f}")
 
 
 if __name__ == "__main__":

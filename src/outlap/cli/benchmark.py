@@ -222,9 +222,8 @@ class BenchmarkMQL:
         return CommandResult(data, lambda console: _print_mql(console, rows))
 
 
-def _measure_mql(settings: BenchmarkMQL, preset: str, beams: int, batch: int) -> dict[str, Any]:
-    import numpy as np
-
+def mql_with_replay(preset: str, beams: int, batch: int, device: str = "cpu") -> Any:
+    """An MQL in worlds of its own, whose replay is filled."""
     from outlap.envs.sb3_vec_env import SB3VecEnv
     from outlap.training.mql import MQLConfig
 
@@ -232,13 +231,20 @@ def _measure_mql(settings: BenchmarkMQL, preset: str, beams: int, batch: int) ->
     env = MQLConfig().env.model_copy(update={"beams": beams, "observation": terms, "augment_tracks": False})
     config = MQLConfig.model_validate(
         {
-            "env": env, "preset": preset, "batch_size": batch, "device": settings.device, "num_envs": MQL_WORLDS,
+            "env": env, "preset": preset, "batch_size": batch, "device": device, "num_envs": MQL_WORLDS,
             "n_steps": 1, "updates_per_step": 1, "learning_starts": FILLED * MQL_WORLDS,
             "buffer_size": 1000 * MQL_WORLDS,
         }
     )  # fmt: skip
     model: Any = config.make_model(SB3VecEnv(MQL_WORLDS, **dict(env)))
     model.learn((FILLED + 4) * MQL_WORLDS)
+    return model
+
+
+def _measure_mql(settings: BenchmarkMQL, preset: str, beams: int, batch: int) -> dict[str, Any]:
+    import numpy as np
+
+    model = mql_with_replay(preset, beams, batch, settings.device)
     updates, rates = [], []
     for _ in range(settings.repeats):
         begin = time.perf_counter()

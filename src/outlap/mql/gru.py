@@ -207,12 +207,12 @@ def _candidate_first(weight: Tensor) -> Tensor:
 
 def _for_gates(weight: Tensor) -> Tensor:
     """(3 hidden, inputs) as `_add_to_gates` reads it: in a panel a register's rows of each of the three parts."""
-    return weight.view(3, -1, LANES, weight.shape[1]).permute(1, 3, 0, 2).contiguous()
+    return weight.reshape(3, -1, LANES, weight.shape[1]).permute(1, 3, 0, 2).contiguous()
 
 
 def _for_inputs(weight: Tensor) -> Tensor:
     """(3 hidden, inputs) as `_add_to_inputs` reads it: in a panel two registers' columns."""
-    return weight.view(len(weight), -1, 2 * LANES).transpose(0, 1).contiguous()
+    return weight.reshape(len(weight), -1, 2 * LANES).transpose(0, 1).contiguous()
 
 
 _f4, _u8 = np.float32, np.uint64
