@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from outlap.errors import OutlapError, brief
 from outlap.files import replacing
 from outlap.mql.gather import gather, gather_side_by_side
+from outlap.mql.recent import Recent, grown
 
 NONE = -1  # serial of no row
 
@@ -124,7 +125,7 @@ class HistoryBuffer:
         self.forget_worlds(num_worlds)
         self.tasks: list[TaskName] = []
         self._numbers: dict[TaskName, int] = {}
-        self._departures: list[_Recent] = []  # of every task: rows that have a row after them
+        self._departures: list[Recent] = []  # of every task: rows that have a row after them
 
     @property
     def num_worlds(self) -> int:
@@ -158,7 +159,7 @@ class HistoryBuffer:
             if task not in self._numbers:
                 self._numbers[task] = len(self.tasks)
                 self.tasks.append(task)
-                self._departures.append(_Recent(self.task_capacity))
+                self._departures.append(Recent(self.task_capacity))
         numbers = np.array([self._numbers[task] for task in tasks], np.int64)
         zero = np.zeros(len(worlds), np.float32)
         action = np.zeros((len(worlds), self.action.shape[1]), np.float32)
@@ -353,16 +354,16 @@ class HistoryBuffer:
             buffer.tasks = facts["tasks"]
             buffer._numbers = {task: number for number, task in enumerate(buffer.tasks)}
             buffer.observation = {
-                name.removeprefix("observation/"): _grown(column, buffer.capacity)
+                name.removeprefix("observation/"): grown(column, buffer.capacity)
                 for name, column in arrays.items()
                 if name.startswith("observation/")
             }
             for name in ROW_FIELDS:
-                setattr(buffer, name, _grown(arrays[name], buffer.capacity))
+                setattr(buffer, name, grown(arrays[name], buffer.capacity))
             buffer._check_columns()
             buffer._departures = []
             for number, (added, ascending) in enumerate(facts["departures"]):
-                recent = _Recent(buffer.task_capacity)
+                recent = Recent(buffer.task_capacity)
                 recent.ring, recent.added, recent.ascending = (
                     arrays[f"departures/{number}"],
                     int(added),
@@ -378,53 +379,6 @@ ROW_FIELDS = {  # type of number and axes
     "action": (np.float32, 2), "reward": (np.float32, 1), "terminated": (np.bool_, 1),
     "before": (np.int64, 1), "after": (np.int64, 1), "task": (np.int64, 1),
 }  # fmt: skip
-
-
-class _Recent:
-    """The newest serials of one task."""
-
-    def __init__(self, capacity: int) -> None:
-        self.ring = np.zeros(min(64, capacity), np.int64)
-        self.capacity = capacity
-        self.added = 0
-        self.ascending = True  # as they come where all worlds step together: then the oldest are found by halves
-
-    def extend(self, serials: np.ndarray) -> None:
-        needed = min(self.added + len(serials), self.capacity)
-        if needed > len(self.ring):  # only ever before the ring has turned over
-            self.ring = _grown(self.ring, min(max(needed, 2 * len(self.ring)), self.capacity))
-        if self.added and serials[0] < self.ring[(self.added - 1) % len(self.ring)]:
-            self.ascending = False
-        self.ring[(self.added + np.arange(len(serials))) % len(self.ring)] = serials
-        self.added += len(serials)
-
-    def count(self, oldest: int) -> int:
-        """How many there are from `oldest` on."""
-        return self.added - self._first(oldest) if self.ascending else int((self._held() >= oldest).sum())
-
-    def draw(self, n: int, rng: np.random.Generator, oldest: int) -> np.ndarray:
-        """`n` of those from `oldest` on."""
-        if self.ascending:
-            return self.ring[rng.integers(self._first(oldest), self.added, n) % len(self.ring)]
-        held = self._held()
-        return rng.choice(held[held >= oldest], n)
-
-    def _held(self) -> np.ndarray:
-        return self.ring[: min(self.added, len(self.ring))]
-
-    def _first(self, oldest: int) -> int:
-        held, turned = self._held(), max(0, self.added - len(self.ring))
-        start = turned % len(self.ring) if turned else 0  # of the ring as it was filled
-        newer = np.searchsorted(held[start:], oldest)
-        if newer == len(held) - start:
-            newer += np.searchsorted(held[:start], oldest)
-        return turned + int(newer)
-
-
-def _grown(rows: np.ndarray, capacity: int) -> np.ndarray:
-    grown = np.zeros((capacity, *rows.shape[1:]), rows.dtype)
-    grown[: len(rows)] = rows
-    return grown
 
 
 @njit(cache=True)

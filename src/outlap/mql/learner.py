@@ -145,8 +145,7 @@ def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:
         return zero, zero
     steps, valid = policy.steps(batch.windows)
     later = torch.as_tensor(batch.steps, device=policy.device)
-    departing, arriving = policy.context(steps, valid, policy.history, later)
-    return departing, arriving
+    return policy.context(steps, valid, policy.history, later)
 
 
 @contextmanager
