@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -127,6 +129,25 @@ def test_interrupt_is_130_and_a_bug_keeps_its_traceback(capsys: pytest.CaptureFi
     assert capsys.readouterr().err == "outlap test lap: interrupted\n"
     with pytest.raises(ZeroDivisionError):
         cli.main(["test", "lap", "--fail", "bug"])
+
+
+@pytest.mark.parametrize("fail", ["", "input", "bug"])
+def test_the_log_is_shown_while_a_command_runs_and_then_is_as_before(
+    fail: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = logging.getLogger("outlap")
+    before = log.level, list(log.handlers)
+    run = Lap.run
+
+    def logs_and_runs(lap: Lap) -> CommandResult:
+        logging.getLogger("outlap.lap").info("planning a line")
+        return run(lap)
+
+    monkeypatch.setattr(Lap, "run", logs_and_runs)
+    with pytest.raises(ZeroDivisionError) if fail == "bug" else contextlib.nullcontext():
+        cli.main(["test", "lap", "--fail", fail])
+    assert capsys.readouterr().err.startswith("planning a line\n")
+    assert (log.level, log.handlers) == before
 
 
 @pytest.mark.parametrize("fault", [errno.ENOSPC, errno.EROFS, errno.EACCES])

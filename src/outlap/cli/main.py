@@ -13,7 +13,7 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 from outlap.cli.interrupts import INTERRUPTED, ctrl_c_spares_imports, end_now
@@ -26,7 +26,6 @@ from outlap.cli.output import (
 )
 from outlap.errors import OutlapError
 
-SHOWN = "outlap-cli"  # name of the handler that shows what is logged
 # A full disk, a quota, a file system or a folder that cannot be written: no bugs.
 STORAGE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.ENOTDIR)
 DONE, BAD_INPUT, OUTPUT_CLOSED = 0, 2, 141
@@ -133,16 +132,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BAD_INPUT
 
 
-def _show_log(quiet: bool) -> None:
-    """What outlap logs goes to standard error: what takes long, unless quiet, and what was left out."""
+@contextlib.contextmanager
+def _log_shown(quiet: bool) -> Iterator[None]:
+    """What outlap logs goes to standard error: what takes long, unless quiet, and what was left out.
+
+    Afterwards the process logs as before: it may be a notebook, and standard error may be another by then.
+    """
     log = logging.getLogger("outlap")
+    level, shown = log.level, logging.StreamHandler()
     log.setLevel(logging.WARNING if quiet else logging.INFO)
-    for handler in log.handlers[:]:  # of a command before in the same process, whose standard error may be closed
-        if handler.name == SHOWN:
-            log.removeHandler(handler)
-    shown = logging.StreamHandler()
-    shown.name = SHOWN
     log.addHandler(shown)
+    try:
+        yield
+    finally:
+        log.removeHandler(shown)
+        log.setLevel(level)
 
 
 def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:
@@ -154,12 +158,12 @@ def _execute(entry: Entry, arguments: Sequence[str], prog: str) -> int:
         command = parse(command_class, arguments, prog)
     except SystemExit:  # after --help
         return DONE
-    _show_log(quiet=getattr(command, "quiet", False))
     check_json_path(command.json)
     only_json = command.json == STANDARD_OUTPUT
-    with standard_output_kept_clean() if only_json else contextlib.nullcontext():
-        result = command.run()
-    deliver(result, command.json)
+    with _log_shown(quiet=getattr(command, "quiet", False)):
+        with standard_output_kept_clean() if only_json else contextlib.nullcontext():
+            result = command.run()
+        deliver(result, command.json)
     return DONE
 
 
