@@ -66,7 +66,8 @@ def gru(
         fit = fit and [tensor.shape for tensor in layer] == shapes
     on_cpu = steps.device.type == "cpu"
     if fit and on_cpu and later is not None:  # elsewhere it is not worth waiting for
-        fit = bool(((later >= 0) & (later + length <= rows)).all())
+        first, last = later.aminmax()
+        fit = 0 <= int(first) and int(last) + length <= rows
     if not fit:
         raise ValueError(f"windows of {length} rows do not fit {tuple(steps.shape)}, or weights or masks do not")
     weights = [tensor for layer in layers for tensor in layer]
@@ -183,9 +184,9 @@ class GRUFunction(torch.autograd.Function):
         of_steps = None
         if ctx.needs_input_grad[0]:
             of_x = of_sums[0, :, : 3 * hidden].to(x.dtype)
-            of_steps = valid.new_zeros(rows * n, inputs)
-            of_steps[: length * n] = of_x @ _candidate_first(weights[0]).to(x.dtype)
-            of_steps = of_steps.view(rows, n, inputs)
+            of_steps = valid.new_empty(rows, n, inputs)
+            of_steps[length:] = 0.0
+            torch.mm(of_x, _candidate_first(weights[0]).to(x.dtype), out=of_steps[:length].view(-1, inputs))
         return of_steps, None, None, None, None, None, *found
 
 

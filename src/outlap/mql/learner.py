@@ -96,7 +96,7 @@ def td3_update(
         seen_by_actor = embedding.detach() if shared else policy.actor.encoder(seen)
         with _frozen(policy.critic.heads):
             chosen = policy.actor(seen_by_actor, context)
-            value = policy.critic(embedding.detach(), chosen, context.detach(), slice(1))[0]
+            value = policy.critic(embedding.detach(), chosen, context.detach(), first_only=True)[0]
         actor_loss = -(value if weights is None else weights * value).mean()
         loss = loss + actor_loss
         record["actor_loss"] = actor_loss.detach()
@@ -113,10 +113,7 @@ def td3_update(
     if update_actor:
         _step(policy.actor_optimizer, settings.max_grad_norm)
         with torch.no_grad():
-            pairs = [(policy.critic_target, policy.critic)]
-            pairs += [(policy.actor_target.head, policy.actor.head) if shared else (policy.actor_target, policy.actor)]
-            for target, new in pairs:
-                torch._foreach_lerp_(list(target.parameters()), list(new.parameters()), settings.tau)  # type: ignore[arg-type]
+            torch._foreach_lerp_(*policy.target_pairs, settings.tau)  # type: ignore[arg-type]
     weighted = each.detach() if weights is None else weights * each.detach()
     return {
         "critic_loss": critic_loss.detach(),

@@ -78,12 +78,12 @@ class ScanConvolution(nn.Module):
     def forward(self, scan: Tensor) -> Tensor:
         if self.missing:
             scan = functional.pad(scan, (0, self.missing))
-        groups = torch.relu(self.groups(scan.unflatten(-1, (-1, self.width))))
-        return torch.relu(self.last(groups.flatten(-2)))
+        groups = torch.relu_(self.groups(scan.reshape(-1, self.width)))
+        return torch.relu_(self.last(groups.view(-1, self.last.in_features)))
 
 
 class TwinMLP(nn.Module):
-    """Two networks of one shape side by side, as one batched product: (n, inputs) → (2, n)."""
+    """Two networks of one shape side by side, as one batched product: (n, inputs) → (2, n), or only the first, (1, n)."""
 
     def __init__(self, inputs: int, hidden: Sequence[int], layer_norm: bool) -> None:
         super().__init__()
@@ -95,15 +95,16 @@ class TwinMLP(nn.Module):
             nn.init.uniform_(weight, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
             nn.init.uniform_(bias, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
 
-    def forward(self, x: Tensor, which: slice = slice(2)) -> Tensor:
-        x = x.expand(len(range(2)[which]), *x.shape)
-        last = len(self.weights) - 1
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = torch.baddbmm(bias[which], x, weight[which])
+    def forward(self, x: Tensor, first_only: bool = False) -> Tensor:
+        weights, biases = ([p[:1] for p in ps] if first_only else list(ps) for ps in (self.weights, self.biases))
+        x = x.expand(len(weights[0]), *x.shape)
+        last = len(weights) - 1
+        for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
             if i < last:
                 if self.layer_norm:
                     x = functional.layer_norm(x, x.shape[-1:])
-                x = torch.relu(x)
+                x = torch.relu_(x)
         return x.squeeze(-1)
 
 
@@ -120,15 +121,15 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """What it sees, an action and the context → two estimates of the return, (2, n), or only some of them."""
+    """What it sees, an action and the context → two estimates of the return, (2, n), or only the first one, (1, n)."""
 
     def __init__(self, encoder: ObservationEncoder, heads: TwinMLP) -> None:
         super().__init__()
         self.encoder = encoder
         self.heads = heads
 
-    def forward(self, embedding: Tensor, action: Tensor, context: Tensor, which: slice = slice(2)) -> Tensor:
-        return self.heads(torch.cat([embedding, action, context], -1), which)
+    def forward(self, embedding: Tensor, action: Tensor, context: Tensor, first_only: bool = False) -> Tensor:
+        return self.heads(torch.cat([embedding, action, context], -1), first_only)
 
 
 class Preset:
@@ -149,7 +150,9 @@ class Preset:
     def term_encoder(self, name: str, size: int) -> tuple[nn.Module, int]:
         """The encoder of a term of `size` numbers, and how many numbers it gives."""
         width = 128 if name == "scan" else 64
-        return nn.Sequential(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()), width
+        return nn.Sequential(
+            nn.Linear(size, width), nn.ReLU(inplace=True), nn.Linear(width, width), nn.ReLU(inplace=True)
+        ), width
 
     def build(self, space: gym.spaces.Dict, actions: int, uses_reward: bool) -> tuple[ContextEncoder, Actor, Critic]:
         """The networks for observations of `space`, which hold PREVIOUS_REWARD for the context alone."""
@@ -201,7 +204,7 @@ class Fast(Preset):
         if name == "scan" and size >= 16:
             return ScanConvolution(size, 64), 64
         width = 64 if name == "scan" else 16
-        return nn.Sequential(nn.Linear(size, width), nn.ReLU()), width
+        return nn.Sequential(nn.Linear(size, width), nn.ReLU(inplace=True)), width
 
 
 PRESETS: dict[str, type[Preset]] = {"paper": Paper, "fast": Fast}
@@ -211,5 +214,5 @@ def _mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     sizes = [inputs, *hidden]
     layers: list[nn.Module] = []
     for a, b in pairwise(sizes):
-        layers += [nn.Linear(a, b), nn.ReLU()]
+        layers += [nn.Linear(a, b), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))

@@ -71,6 +71,11 @@ class MQLPolicy(BasePolicy):
         self.actor_target.requires_grad_(False)
         self.critic_target.requires_grad_(False)
         self.shares_encoder = shape.shared_encoder
+        # Targets and what they follow, in the same order; what actor and critics share is named once.
+        self.target_pairs = tuple(
+            list(torch.nn.ModuleList(pair).parameters())
+            for pair in ((self.actor_target, self.critic_target), (self.actor, self.critic))
+        )
         self.trains_in_bfloat16 = shape.trains_in_bfloat16
         self.make_optimizers(lr_schedule(1.0))
 
@@ -99,7 +104,10 @@ class MQLPolicy(BasePolicy):
         rows = steps.flatten(0, 1)  # whose columns a layer reads where they are
         terms = {name: rows[:, windows.columns[name]] for name in self.window_terms}
         read = [embed[name](term) if name in embed else term for name, term in terms.items()]
-        return torch.cat([rows[:, : self._actions], *read], -1).unflatten(0, valid.shape), valid
+        read.insert(0, rows[:, : self._actions])
+        return torch.cat([x.contiguous() for x in read], -1).unflatten(
+            0, valid.shape
+        ), valid  # others are copied slowly
 
     def encode(self, windows: Windows) -> Tensor:
         """The context z (n, hidden) at the end of each window."""

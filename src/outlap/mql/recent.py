@@ -12,6 +12,7 @@ class Recent:
         self.ring = np.zeros(min(64, capacity), np.int64)
         self.capacity = capacity
         self.added = 0
+        self._found = (0, 0, 0)  # by `_first`: for which `oldest` and `added`, and what
         self.ascending = True  # as they come where all worlds step together: then the oldest are found by halves
 
     def extend(self, serials: np.ndarray) -> None:
@@ -38,12 +39,14 @@ class Recent:
         return self.ring[: min(self.added, len(self.ring))]
 
     def _first(self, oldest: int) -> int:
-        held, turned = self._held(), max(0, self.added - len(self.ring))
-        start = turned % len(self.ring) if turned else 0  # of the ring as it was filled
-        newer = np.searchsorted(held[start:], oldest)
-        if newer == len(held) - start:
-            newer += np.searchsorted(held[:start], oldest)
-        return turned + int(newer)
+        if self._found[:2] != (oldest, self.added):
+            held, turned = self._held(), max(0, self.added - len(self.ring))
+            start = turned % len(self.ring) if turned else 0  # of the ring as it was filled
+            newer = np.searchsorted(held[start:], oldest)
+            if newer == len(held) - start:
+                newer += np.searchsorted(held[:start], oldest)
+            self._found = oldest, self.added, turned + int(newer)
+        return self._found[2]
 
 
 def grown(rows: np.ndarray, capacity: int) -> np.ndarray:
