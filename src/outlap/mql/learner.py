@@ -109,9 +109,9 @@ def td3_update(
     for parameter in policy.adapted_parameters():
         parameter.grad = None
     loss.backward()
-    grad_norm = _step(policy.critic_optimizer, settings.max_grad_norm)
+    grad_norm = policy.critic_optimizer.step_clipped(settings.max_grad_norm)
     if update_actor:
-        _step(policy.actor_optimizer, settings.max_grad_norm)
+        policy.actor_optimizer.step_clipped(settings.max_grad_norm)
         with torch.no_grad():
             torch._foreach_lerp_(*policy.target_pairs, settings.tau)  # type: ignore[arg-type]
     weighted = each.detach() if weights is None else weights * each.detach()
@@ -123,16 +123,6 @@ def td3_update(
         "grad_norm": grad_norm.detach(),
         **record,
     }
-
-
-def _step(optimizer: torch.optim.Optimizer, max_norm: float) -> Tensor:
-    """Change the parameters by their gradients, which are clipped together; their norm before."""
-    parameters = optimizer.param_groups[0]["params"]
-    norm = nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-    if norm.device.type != "cpu" or not norm <= max_norm:  # elsewhere it is not worth waiting for; nan goes to all
-        nn.utils.clip_grads_with_norm_(parameters, max_norm, norm)
-    optimizer.step()
-    return norm
 
 
 def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor
 
 from outlap.errors import OutlapError
+from outlap.mql.adam import Adam
 from outlap.mql.buffers import HistoryBuffer, Windows
 from outlap.mql.networks import PRESETS, PREVIOUS_REWARD
 
@@ -82,10 +83,8 @@ class MQLPolicy(BasePolicy):
     def make_optimizers(self, learning_rate: float) -> None:
         """New optimizers; the context belongs to the critics' one, and is trained by both losses."""
         ours = self.actor.head if self.shares_encoder else self.actor
-        self.actor_optimizer = torch.optim.Adam(ours.parameters(), lr=learning_rate, fused=True)
-        self.critic_optimizer = torch.optim.Adam(
-            [*self.critic.parameters(), *self.context.parameters()], lr=learning_rate, fused=True
-        )
+        self.actor_optimizer = Adam(ours.parameters(), learning_rate)
+        self.critic_optimizer = Adam([*self.critic.parameters(), *self.context.parameters()], learning_rate)
 
     def adapted_parameters(self) -> list[torch.nn.Parameter]:
         """What learning changes: actor, critics and context, each once."""
