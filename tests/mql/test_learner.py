@@ -52,11 +52,18 @@ def policy(preset: str, **kwargs) -> MQLPolicy:
     return made
 
 
+class PlainDescent(torch.optim.SGD):
+    def step_clipped(self, max_norm: float) -> torch.Tensor:
+        norm = torch.nn.utils.clip_grad_norm_(self.param_groups[0]["params"], max_norm)
+        self.step()
+        return norm
+
+
 def use_plain_gradient_descent(p: MQLPolicy) -> None:
     """In place of Adam, whose first step is the gradient's sign: where that is as good as 0, rounding decides."""
     p.make_optimizers(1e-2)
     p.actor_optimizer, p.critic_optimizer = (  # type: ignore[assignment]
-        torch.optim.SGD(optimizer.param_groups[0]["params"], lr=1e-2)
+        PlainDescent(optimizer.param_groups[0]["params"], lr=1e-2)
         for optimizer in (p.actor_optimizer, p.critic_optimizer)
     )
 

@@ -32,7 +32,8 @@ class Adam(torch.optim.Adam):
         """
         (group,) = self.param_groups
         parameters = [p for p in group["params"] if p.grad is not None]
-        if not all(p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in parameters):
+        by_kernels = all(p.device.type == "cpu" and p.dtype == torch.float32 and p.is_contiguous() for p in parameters)
+        if not parameters or not by_kernels:
             norm = nn.utils.clip_grad_norm_(parameters, max_norm)
             self.step()
             return norm

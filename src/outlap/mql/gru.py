@@ -65,9 +65,9 @@ def gru(
         shapes = [(3 * hidden, hidden if i else inputs), (3 * hidden,), (3 * hidden, hidden), (3 * hidden,)]
         fit = fit and [tensor.shape for tensor in layer] == shapes
     on_cpu = steps.device.type == "cpu"
-    if fit and on_cpu and later is not None:  # elsewhere it is not worth waiting for
+    if fit and on_cpu and later is not None and n:  # elsewhere it is not worth waiting for
         first, last = later.aminmax()
-        fit = 0 <= int(first) and int(last) + length <= rows
+        fit = int(first) >= 0 and int(last) + length <= rows
     if not fit:
         raise ValueError(f"windows of {length} rows do not fit {tuple(steps.shape)}, or weights or masks do not")
     weights = [tensor for layer in layers for tensor in layer]
@@ -176,17 +176,18 @@ class GRUFunction(torch.autograd.Function):
         of_inputs = x[: length * n]
         for i, states in enumerate(made[1::2]):
             of_x, of_h = of_sums[i, :, : 3 * hidden], of_sums[i, n:, hidden:]
-            candidate, gates = (of_inputs.t() @ of_x.to(of_inputs.dtype)).t().split([hidden, 2 * hidden])
-            of_candidate, of_gates, of_share = of_biases[i].sum(0).split([hidden, 2 * hidden, hidden])
-            found += [torch.cat([gates, candidate]).float(), torch.cat([of_gates, of_candidate])]
-            found += [of_h.t() @ states[n : length * n], torch.cat([of_gates, of_share])]
+            of_input_weight = (of_inputs.t() @ of_x.to(of_inputs.dtype)).t().roll(-hidden, 0).float()
+            sums = of_biases[i].sum(0)
+            found += [of_input_weight, sums[: 3 * hidden].roll(-hidden)]
+            found += [of_h.t() @ states[n : length * n], sums[hidden:]]
             of_inputs = states[n:]
         of_steps = None
         if ctx.needs_input_grad[0]:
             of_x = of_sums[0, :, : 3 * hidden].to(x.dtype)
-            of_steps = valid.new_empty(rows, n, inputs)
+            of_steps = x.new_empty(rows, n, inputs)
             of_steps[length:] = 0.0
             torch.mm(of_x, _candidate_first(weights[0]).to(x.dtype), out=of_steps[:length].view(-1, inputs))
+            of_steps = of_steps.float()
         return of_steps, None, None, None, None, None, *found
 
 

@@ -83,7 +83,7 @@ class ScanConvolution(nn.Module):
 
 
 class TwinMLP(nn.Module):
-    """Two networks of one shape side by side, as one batched product: (n, inputs) → (2, n), or only the first, (1, n)."""
+    """Two networks of one shape side by side, as one batched product: (n, inputs) → (2, n), or (1, n) of the first."""
 
     def __init__(self, inputs: int, hidden: Sequence[int], layer_norm: bool) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """What it sees, an action and the context → two estimates of the return, (2, n), or only the first one, (1, n)."""
+    """What it sees, an action and the context → two estimates of the return, (2, n), or (1, n), the first."""
 
     def __init__(self, encoder: ObservationEncoder, heads: TwinMLP) -> None:
         super().__init__()
@@ -150,9 +150,7 @@ class Preset:
     def term_encoder(self, name: str, size: int) -> tuple[nn.Module, int]:
         """The encoder of a term of `size` numbers, and how many numbers it gives."""
         width = 128 if name == "scan" else 64
-        return nn.Sequential(
-            nn.Linear(size, width), nn.ReLU(inplace=True), nn.Linear(width, width), nn.ReLU(inplace=True)
-        ), width
+        return nn.Sequential(*_mlp(size, [width], width), nn.ReLU(inplace=True)), width
 
     def build(self, space: gym.spaces.Dict, actions: int, uses_reward: bool) -> tuple[ContextEncoder, Actor, Critic]:
         """The networks for observations of `space`, which hold PREVIOUS_REWARD for the context alone."""
@@ -204,7 +202,7 @@ class Fast(Preset):
         if name == "scan" and size >= 16:
             return ScanConvolution(size, 64), 64
         width = 64 if name == "scan" else 16
-        return nn.Sequential(nn.Linear(size, width), nn.ReLU(inplace=True)), width
+        return nn.Sequential(*_mlp(size, [], width), nn.ReLU(inplace=True)), width
 
 
 PRESETS: dict[str, type[Preset]] = {"paper": Paper, "fast": Fast}

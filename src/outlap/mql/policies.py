@@ -103,10 +103,7 @@ class MQLPolicy(BasePolicy):
         rows = steps.flatten(0, 1)  # whose columns a layer reads where they are
         terms = {name: rows[:, windows.columns[name]] for name in self.window_terms}
         read = [embed[name](term) if name in embed else term for name, term in terms.items()]
-        read.insert(0, rows[:, : self._actions])
-        return torch.cat([x.contiguous() for x in read], -1).unflatten(
-            0, valid.shape
-        ), valid  # others are copied slowly
+        return torch.cat([rows[:, : self._actions], *read], -1).unflatten(0, valid.shape), valid
 
     def encode(self, windows: Windows) -> Tensor:
         """The context z (n, hidden) at the end of each window."""
