@@ -41,7 +41,7 @@ def row_loop(kernel: CFunc, rows: int, *given: int | Tensor) -> None:
     Raises ValueError for other tensors, and for types of number that a kernel cannot read.
     """
     for tensor in (g for g in given if isinstance(g, Tensor)):
-        if not tensor.is_contiguous() or tensor.device.type != "cpu" or tensor.dtype not in DTYPES:
+        if not tensor.is_contiguous() or not tensor.is_cpu or tensor.dtype not in DTYPES:
             raise ValueError(f"a row loop takes contiguous tensors of the CPU, of {', '.join(map(str, DTYPES))}")
     numbers = np.array([0, rows, *(g.data_ptr() if isinstance(g, Tensor) else g for g in given)], np.uint64)
     threads = min(torch.get_num_threads(), rows // ROWS_OF_THREAD)
