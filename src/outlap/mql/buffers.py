@@ -242,7 +242,10 @@ class HistoryBuffer:
             raise OutlapError("replay: holds no transition yet")
         chances = (counts > 0) / (counts > 0).sum() if by_task else counts / counts.sum()
         of_task = rng.multinomial(n, chances)
-        drawn = [recent.draw(k, rng, self.oldest) for recent, k in zip(self._departures, of_task, strict=True) if k]
+        places = np.split(rng.integers(0, np.repeat(counts, of_task)), np.cumsum(of_task)[:-1])
+        drawn = [
+            recent.at(place, self.oldest) for recent, place in zip(self._departures, places, strict=True) if len(place)
+        ]
         return np.concatenate(drawn)
 
     def windows(self, serial: np.ndarray, length: int, terms: Sequence[str]) -> Windows:

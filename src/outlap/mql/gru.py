@@ -138,8 +138,6 @@ class GRUFunction(torch.autograd.Function):
             made = [
                 (valid.new_empty(max(kept, 1) * n, 4 * hidden), valid.new_empty((kept + 1) * n, hidden)) for _ in layers
             ]
-            for _, states in made:
-                states[:n] = 0.0
             each = [number for pack, pair in zip(packed, made, strict=True) for number in (*pack, *pair)]
             row_loop(_forwards, n, hidden, length, len(layers), int(kept > 0), valid, first, projected, *each)
             return made
@@ -248,7 +246,7 @@ def _sigmoid(x):
 def _forwards(given):
     n, hidden, length, layers, keeps = given[1], given[2], given[3], given[4], given[5]
     valid, first, projected = floats(given[6]), integers(given[7]), floats(given[8])
-    width, kept = _4 * hidden, n * keeps  # rows from one step to the next, of which none or all are kept
+    width, kept, zero = _4 * hidden, n * keeps, splat(_f4(0))  # rows from one step to the next: none or all are kept
     begin = take(given)
     while begin < n:
         rows = min(_block, n - begin)
@@ -287,18 +285,18 @@ def _forwards(given):
                         r, u, s = c + hidden, c + _2 * hidden, c + _3 * hidden
                         reset, update = _sigmoid(load(gates, r)), _sigmoid(load(gates, u))
                         candidate = _tanh(load(gates, c) + reset * load(gates, s))
+                        state = load(states, before + h) if t > _0 else zero
                         store(gates, c, candidate)
                         store(gates, r, reset)
                         store(gates, u, update)
-                        state = candidate + update * (load(states, before + h) - candidate)
-                        store(states, after + h, keep * state)
+                        store(states, after + h, keep * (candidate + update * (state - candidate)))
         begin = take(given)
 
 
 @cfunc(ROW_LOOP, **_OPTIONS)
 def _backwards(given):
     n, hidden, length, layers, valid = given[1], given[2], given[3], given[4], floats(given[5])
-    width, one, pair = _4 * hidden, splat(_f4(1)), _2 * _lanes
+    width, zero, one, pair = _4 * hidden, splat(_f4(0)), splat(_f4(1)), _2 * _lanes
     panels = hidden // pair
     begin = take(given)
     while begin < n:
@@ -321,7 +319,8 @@ def _backwards(given):
                         candidate, reset, update = load(gates, c), load(gates, r), load(gates, u)
                         of_state = keep * load(back, b)
                         of_candidate = of_state * (one - update) * (one - candidate * candidate)
-                        of_update = of_state * (load(states, hidden * n * t + b) - candidate) * update * (one - update)
+                        state = load(states, hidden * n * t + b) if t > _0 else zero
+                        of_update = of_state * (state - candidate) * update * (one - update)
                         of_share = of_candidate * reset
                         of_reset = of_share * load(gates, s) * (one - reset)
                         store(back, b, of_state * update)

@@ -28,12 +28,12 @@ class Recent:
         """How many there are from `oldest` on."""
         return self.added - self._first(oldest) if self.ascending else int((self._held() >= oldest).sum())
 
-    def draw(self, n: int, rng: np.random.Generator, oldest: int) -> np.ndarray:
-        """`n` of those from `oldest` on."""
+    def at(self, places: np.ndarray, oldest: int) -> np.ndarray:
+        """Those at some places, 0 … count - 1, among the ones from `oldest` on."""
         if self.ascending:
-            return self.ring[rng.integers(self._first(oldest), self.added, n) % len(self.ring)]
+            return self.ring[(self._first(oldest) + places) % len(self.ring)]
         held = self._held()
-        return rng.choice(held[held >= oldest], n)
+        return held[held >= oldest][places]
 
     def _held(self) -> np.ndarray:
         return self.ring[: min(self.added, len(self.ring))]
