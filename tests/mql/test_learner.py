@@ -139,21 +139,21 @@ def test_an_update_is_a_plain_td3_step_of_both_losses(preset: str, n_steps: int,
         torch.testing.assert_close(mine, other)
 
 
-def test_targets_follow_slowly_and_only_with_the_actor() -> None:
-    p = policy("fast")
+@pytest.mark.parametrize("copied", [False, True])
+@pytest.mark.parametrize("preset", ["paper", "fast"])
+def test_targets_follow_slowly_and_only_with_the_actor(preset: str, copied: bool) -> None:
+    p = copy.deepcopy(policy(preset)) if copied else policy(preset)
     before = copy.deepcopy(p)
     td3_update(p, replay(), STILL, torch.Generator(), update_actor=False)
-    for now, then in zip(p.critic_target.parameters(), before.critic_target.parameters(), strict=True):
-        assert torch.equal(now, then)
-    for now, then in zip(p.actor.head.parameters(), before.actor.head.parameters(), strict=True):
+    still = [(p.critic_target, before.critic_target), (p.actor_target, before.actor_target)]
+    still += [(p.actor.head, before.actor.head)]
+    for now, then in ((now, then) for pair in still for now, then in zip(*(m.parameters() for m in pair), strict=True)):
         assert torch.equal(now, then)
     td3_update(p, replay(), STILL, torch.Generator(), update_actor=True)
-    pairs = [*zip(p.critic_target.parameters(), before.critic_target.parameters(), p.critic.parameters(), strict=True)]
-    pairs += zip(
-        p.actor_target.head.parameters(), before.actor_target.head.parameters(), p.actor.head.parameters(), strict=True
-    )
-    for now, then, network in pairs:
-        torch.testing.assert_close(now, then + STILL.tau * (network - then))
+    networks = [(p.critic_target, before.critic_target, p.critic), (p.actor_target, before.actor_target, p.actor)]
+    for modules in networks:
+        for now, then, network in zip(*(module.parameters() for module in modules), strict=True):
+            torch.testing.assert_close(now, then + STILL.tau * (network - then))
 
 
 def test_the_proximal_term_pulls_towards_its_anchor() -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from outlap.mql.buffers import Batch
 from outlap.mql.policies import MQLPolicy, to_tensor
@@ -94,9 +92,8 @@ def td3_update(
     record = {}
     if update_actor:
         seen_by_actor = embedding.detach() if shared else policy.actor.encoder(seen)
-        with _frozen(policy.critic.heads):
-            chosen = policy.actor(seen_by_actor, context)
-            value = policy.critic(embedding.detach(), chosen, context.detach(), first_only=True)[0]
+        chosen = policy.actor(seen_by_actor, context)
+        value = policy.critic(embedding.detach(), chosen, context.detach(), for_actor=True)[0]
         actor_loss = -(value if weights is None else weights * value).mean()
         loss = loss + actor_loss
         record["actor_loss"] = actor_loss.detach()
@@ -113,7 +110,7 @@ def td3_update(
     if update_actor:
         policy.actor_optimizer.step_clipped(settings.max_grad_norm)
         with torch.no_grad():
-            torch._foreach_lerp_(*policy.target_pairs, settings.tau)  # type: ignore[arg-type]
+            torch._foreach_lerp_(policy.targets, policy.followed, settings.tau)  # type: ignore[arg-type]
     weighted = each.detach() if weights is None else weights * each.detach()
     return {
         "critic_loss": critic_loss.detach(),
@@ -133,15 +130,3 @@ def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:
     steps, valid = policy.steps(batch.windows)
     later = torch.as_tensor(batch.steps, device=policy.device)
     return policy.context(steps, valid, policy.history, later)
-
-
-@contextmanager
-def _frozen(module: nn.Module) -> Iterator[None]:
-    """Without gradients for a module's own parameters."""
-    for parameter in module.parameters():
-        parameter.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for parameter in module.parameters():
-            parameter.requires_grad_(True)

@@ -83,7 +83,10 @@ class ScanConvolution(nn.Module):
 
 
 class TwinMLP(nn.Module):
-    """Two networks of one shape side by side, as one batched product: (n, inputs) → (2, n), or (1, n) of the first."""
+    """Two networks of one shape side by side, as one batched product: (n, inputs) → (2, n).
+
+    For the actor, which climbs the first one: (1, n), without gradient for the parameters.
+    """
 
     def __init__(self, inputs: int, hidden: Sequence[int], layer_norm: bool) -> None:
         super().__init__()
@@ -95,8 +98,10 @@ class TwinMLP(nn.Module):
             nn.init.uniform_(weight, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
             nn.init.uniform_(bias, -1.0 / math.sqrt(a), 1.0 / math.sqrt(a))
 
-    def forward(self, x: Tensor, first_only: bool = False) -> Tensor:
-        weights, biases = ([p[:1] for p in ps] if first_only else list(ps) for ps in (self.weights, self.biases))
+    def forward(self, x: Tensor, for_actor: bool = False) -> Tensor:
+        weights, biases = (
+            [p.detach()[:1] for p in ps] if for_actor else list(ps) for ps in (self.weights, self.biases)
+        )
         x = x.expand(len(weights[0]), *x.shape)
         last = len(weights) - 1
         for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
@@ -121,15 +126,15 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """What it sees, an action and the context → two estimates of the return, (2, n), or (1, n), the first."""
+    """What it sees, an action and the context → two estimates of the return, (2, n); for the actor see `TwinMLP`."""
 
     def __init__(self, encoder: ObservationEncoder, heads: TwinMLP) -> None:
         super().__init__()
         self.encoder = encoder
         self.heads = heads
 
-    def forward(self, embedding: Tensor, action: Tensor, context: Tensor, first_only: bool = False) -> Tensor:
-        return self.heads(torch.cat([embedding, action, context], -1), first_only)
+    def forward(self, embedding: Tensor, action: Tensor, context: Tensor, for_actor: bool = False) -> Tensor:
+        return self.heads(torch.cat([embedding, action, context], -1), for_actor)
 
 
 class Preset:

@@ -72,8 +72,8 @@ class MQLPolicy(BasePolicy):
         self.actor_target.requires_grad_(False)
         self.critic_target.requires_grad_(False)
         self.shares_encoder = shape.shared_encoder
-        # Targets and what they follow, in the same order; what actor and critics share is named once.
-        self.target_pairs = tuple(
+        # Parameters of the targets and those that they follow, in the same order; what actor and critics share once.
+        self.targets, self.followed = (
             list(torch.nn.ModuleList(pair).parameters())
             for pair in ((self.actor_target, self.critic_target), (self.actor, self.critic))
         )
