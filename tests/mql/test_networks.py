@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from functools import partial
 
 import gymnasium as gym
@@ -13,6 +14,14 @@ import torch
 from outlap.mql.gru import Layer, gru
 from outlap.mql.lanes import LANES
 from outlap.mql.networks import PRESETS, ContextEncoder, ScanConvolution, TwinMLP
+
+
+@pytest.fixture(autouse=True)
+def _nan_where_nothing_was_written() -> Iterator[None]:
+    """So that a kernel which reads there shows."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
 
 
 def space(**sizes: int) -> gym.spaces.Dict:

@@ -246,7 +246,8 @@ def _sigmoid(x):
 def _forwards(given):
     n, hidden, length, layers, keeps = given[1], given[2], given[3], given[4], given[5]
     valid, first, projected = floats(given[6]), integers(given[7]), floats(given[8])
-    width, kept, zero = _4 * hidden, n * keeps, splat(_f4(0))  # rows from one step to the next: none or all are kept
+    width, zero = _4 * hidden, splat(_f4(0))
+    kept = n * keeps  # rows from one step to the next, of which none or all are kept
     begin = take(given)
     while begin < n:
         rows = min(_block, n - begin)
