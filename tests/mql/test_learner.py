@@ -147,8 +147,9 @@ def test_targets_follow_slowly_and_only_with_the_actor(preset: str, copied: bool
     td3_update(p, replay(), STILL, torch.Generator(), update_actor=False)
     still = [(p.critic_target, before.critic_target), (p.actor_target, before.actor_target)]
     still += [(p.actor.head, before.actor.head)]
-    for now, then in ((now, then) for pair in still for now, then in zip(*(m.parameters() for m in pair), strict=True)):
-        assert torch.equal(now, then)
+    for modules in still:
+        for now, then in zip(*(module.parameters() for module in modules), strict=True):
+            assert torch.equal(now, then)
     td3_update(p, replay(), STILL, torch.Generator(), update_actor=True)
     networks = [(p.critic_target, before.critic_target, p.critic), (p.actor_target, before.actor_target, p.actor)]
     for modules in networks:
