@@ -1,9 +1,13 @@
-"""Actions: (steer, speed) in [-1, 1], and the commands that they mean."""
+"""Actions: (steer, speed) in [-1, 1]; their validation and their conversion to commands."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from outlap.drivers.driver import Driver
+from outlap.errors import OutlapError
 from outlap.simulator.vehicle import STEER_MAX, STEER_MIN, V_MAX, V_MIN
 
 
@@ -37,3 +41,37 @@ def commands(actions: np.ndarray, params: np.ndarray, speeds: np.ndarray) -> np.
     out[..., 0] = np.where(steer >= 0.0, steer * params[..., STEER_MAX], -steer * params[..., STEER_MIN])
     out[..., 1] = speeds[..., 0] + 0.5 * (speed + 1.0) * (speeds[..., 1] - speeds[..., 0])
     return out
+
+
+def check_actions(answer: Any, shape: tuple[int, ...], who: str) -> np.ndarray:
+    """Validate actions from outside and clip them to [-1, 1]: float32.
+
+    Args:
+        answer: the actions, as given.
+        shape: the shape that they must have, (..., 2).
+        who: where they come from; an error message begins with it.
+
+    Raises OutlapError for values that are not numbers, for another shape, and for NaN and infinity.
+    """
+    try:
+        actions = np.asarray(answer)
+    except ValueError:  # rows of unequal lengths
+        actions = np.array(None)
+    if actions.dtype.kind not in "fiub":
+        raise OutlapError(f"{who} {answer!r:.60}; must be numbers {shape}")
+    if actions.shape != shape:
+        raise OutlapError(f"{who} actions of shape {actions.shape}; must be {shape}")
+    finite = np.isfinite(actions).all(axis=-1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        where = f" (row {row})" if len(shape) > 1 else ""
+        raise OutlapError(f"{who} the action {np.atleast_2d(actions)[row].tolist()}; must be finite{where}")
+    return np.clip(actions, -1.0, 1.0).astype(np.float32, copy=False)
+
+
+def driver_actions(driver: Driver, observation: dict[str, np.ndarray], count: int) -> np.ndarray:
+    """Return a driver's actions for `count` cars: float32 (count, 2) in [-1, 1].
+
+    Raises OutlapError that names the driver if its actions are not numbers, not finite, or of a wrong shape.
+    """
+    return check_actions(driver.act(observation), (count, 2), f"driver {driver.name}: gave")

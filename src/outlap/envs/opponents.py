@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from outlap.config import Number, bounds
-from outlap.drivers.driver import Driver, ask
+from outlap.drivers.driver import Driver
 from outlap.drivers.mlp import DriverStack, MLPDriver
+from outlap.envs.actions import driver_actions
 from outlap.envs.observations import OBSERVATION_TERMS, observe
 from outlap.envs.race import Race
 from outlap.errors import OutlapError
@@ -111,7 +112,7 @@ class Opponents:
                 continue
             driver.begin(self._begins.ravel())
             flat = {name: value.reshape(worlds * cars, -1) for name, value in observation.items()}
-            out[mine] = ask(driver, flat, worlds * cars).reshape(worlds, cars, 2)[mine]
+            out[mine] = driver_actions(driver, flat, worlds * cars).reshape(worlds, cars, 2)[mine]
         self._begins[:] = False
         if self.noise.any():
             out += self.noise[..., None] * self._normal(2 * cars).reshape(worlds, cars, 2)

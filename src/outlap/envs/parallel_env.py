@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from pettingzoo import ParallelEnv
 
-from outlap.drivers.driver import checked_actions
+from outlap.envs.actions import check_actions
 from outlap.envs.race_vector_env import CONTACTS, RaceVectorEnv
 from outlap.envs.terminations import CRASH, RUNNING
 from outlap.errors import OutlapError
@@ -95,7 +95,7 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         for agent in self.agents:
             if agent not in actions:
                 raise OutlapError(f"actions: none for {agent}; must have one for each of {', '.join(self.agents)}")
-            everyone[0, self._cars[agent]] = checked_actions(actions[agent], (2,), f"{agent}: given")
+            everyone[0, self._cars[agent]] = check_actions(actions[agent], (2,), f"{agent}: given")
         return everyone
 
     def _observe(self) -> dict[str, dict[str, np.ndarray]]:

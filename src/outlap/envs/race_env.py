@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from outlap.drivers.driver import checked_actions
+from outlap.envs.actions import check_actions
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 
@@ -60,7 +60,7 @@ class RaceEnv(gym.Env):
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Carry out an action (2,) in [-1, 1]: steering, speed. Raises OutlapError as `RaceVectorEnv` does."""
-        action = checked_actions(action, (2,), "step: given")
+        action = check_actions(action, (2,), "step: given")
         observation, reward, terminated, truncated, info = self._env.step(action[None])
         self._show()
         return _only(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _only(info)

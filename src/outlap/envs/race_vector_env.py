@@ -12,9 +12,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from outlap.config import bounds, validate
-from outlap.drivers.driver import Driver, checked_actions
+from outlap.drivers.driver import Driver
 from outlap.drivers.find import Named, driver_name, find_drivers
-from outlap.envs.actions import commands, speed_spans
+from outlap.envs.actions import check_actions, commands, speed_spans
 from outlap.envs.observations import observation_space, observe
 from outlap.envs.opponents import Opponents
 from outlap.envs.race import EGO, Race
@@ -304,7 +304,7 @@ class RaceVectorEnv(VectorEnv):
     def _all_actions(self, actions: np.ndarray) -> np.ndarray:
         """The ego's actions, checked and clipped, with those of the opponents: (worlds, cars, 2)."""
         everyone = np.empty((self.num_envs, self.config.num_cars, 2), np.float32)
-        everyone[:, EGO] = checked_actions(actions, (self.num_envs, 2), "step: given")
+        everyone[:, EGO] = check_actions(actions, (self.num_envs, 2), "step: given")
         if self.config.num_cars > 1 and not self._over.any():
             if self._opponents is None:
                 raise OutlapError("opponents: none given; step drives the first car only, advance all of them")

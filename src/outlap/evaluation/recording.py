@@ -15,7 +15,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from outlap.config import Config, validate
-from outlap.drivers.driver import Driver, ask
+from outlap.drivers.driver import Driver
+from outlap.envs.actions import driver_actions
 from outlap.envs.frame import MOTION, Cast, Frame, Words, X, Y, between, cast_of, frame_of
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
@@ -186,7 +187,7 @@ def record_episode(
     over = False
     while not over:
         race.training_steps = CURRICULA_OVER
-        action = ask(driver, observation, 1)
+        action = driver_actions(driver, observation, 1)
         observation, _, terminated, truncated, info = race.step(action)
         watcher.see(info, action[0])
         over = bool(terminated[0] or truncated[0])
@@ -283,7 +284,7 @@ def record_lap(driver: Driver, env: RaceConfig, track: Track, seed: int = 0) -> 
     driver.begin(np.ones(1, bool))
     worlds, lap = race.race.worlds, []
     while True:
-        observation, _, terminated, truncated, info = race.step(ask(driver, observation, 1))
+        observation, _, terminated, truncated, info = race.step(driver_actions(driver, observation, 1))
         begun = worlds.lap_start[0, EGO]
         if not (np.isnan(begun) or worlds.laps[0, EGO]):
             state = worlds.state[0, EGO]

@@ -17,9 +17,10 @@ import numpy as np
 import pandas as pd
 from gymnasium.vector import AutoresetMode
 
-from outlap.drivers.driver import Driver, ask
+from outlap.drivers.driver import Driver
 from outlap.drivers.find import find_drivers
 from outlap.drivers.policy import PolicyDriver
+from outlap.envs.actions import driver_actions
 from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
@@ -199,7 +200,7 @@ def _race(
     steps = 0
     while len(rows) < len(seeds):
         env.training_steps = CURRICULA_OVER
-        observation, rewards, terminated, truncated, info = env.step(ask(driver, observation, worlds))
+        observation, rewards, terminated, truncated, info = env.step(driver_actions(driver, observation, worlds))
         steps += int((racing != IDLE).sum())
         over = terminated | truncated
         last, returns = score.step(env.race, rewards, info)

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from outlap.drivers.driver import Driver, ask
+from outlap.drivers.driver import Driver
+from outlap.envs.actions import driver_actions
 from outlap.envs.frame import Frame, between, cast_of, frame_of
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
@@ -113,7 +114,9 @@ class Watch:
         self._trail.add(self._before)
         if self.driven is not None:
             self.env.taken_over = {self.driven: self._action.astype(np.float32)}
-        self._observation, _, terminated, truncated, info = self.env.step(ask(self.driver, self._observation, 1))
+        self._observation, _, terminated, truncated, info = self.env.step(
+            driver_actions(self.driver, self._observation, 1)
+        )
         self._now = frame_of(self.env)
         if terminated[0] or truncated[0]:
             self._outcome, self._rest = how_it_ended(info), REST
