@@ -26,13 +26,13 @@ from outlap.experiments.definitions import changed
 from outlap.experiments.engine import ONE_THREAD
 from outlap.files import atomic_write, to_json
 from outlap.processes import process_environment
+from outlap.provenance import provenance
 from outlap.track.catalog import list_tracks
 from outlap.track.generate import BUILTIN_TRAIN
 from outlap.track.track import Track
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.recurrent_ppo import RecurrentPPOConfig
-from outlap.training.run import provenance
 from outlap.training.session import TrainingConfig, train
 
 TURN = 300.0  # [s] of each training of the second process

@@ -16,9 +16,9 @@ import outlap  # noqa: F401
 from outlap.envs.frame import Cast, Frame
 from outlap.envs.race_env import RaceEnv
 from outlap.errors import OutlapError
+from outlap.figure_style import BLUE, WALL_GREY
 from outlap.simulator.collision import FREE, HIT_WALL, REMOVED
 from outlap.track.track import Track
-from outlap.viewer.colours import BLUE, WALL_GREY
 from outlap.viewer.scene import LONGEST_TRAIL, PAPER, RIVAL_GREY, Camera, Entry, Scene, Trail, bytes_of
 from synthetic_tracks import ring
 

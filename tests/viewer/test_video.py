@@ -10,7 +10,7 @@ from imageio_ffmpeg import read_frames
 from PIL import Image
 
 from outlap.errors import OutlapError
-from outlap.viewer.colours import BLUE, COLOURS, VERMILLION
+from outlap.figure_style import BLUE, COLOURS, VERMILLION
 from outlap.viewer.scene import bytes_of
 from outlap.viewer.video import count_pictures, write_video
 from recordings import circling

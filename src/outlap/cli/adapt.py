@@ -138,8 +138,9 @@ class Adapt:
         from outlap.evaluation.rollout import evaluate, standing_starts
         from outlap.mql.adaptation import AdaptationSettings, adapt
         from outlap.mql.propensity import CLIP_RULES
+        from outlap.provenance import provenance
         from outlap.training.mql import load_meta
-        from outlap.training.run import load_run, provenance
+        from outlap.training.run import load_run
 
         for name in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
             check_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)

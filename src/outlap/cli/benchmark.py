@@ -13,8 +13,8 @@ from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
 from outlap.processes import in_new_process
+from outlap.provenance import machine
 from outlap.training.device import check_device
-from outlap.training.run import machine
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -13,7 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
-from outlap.training.run import machine
+from outlap.provenance import machine
 
 if TYPE_CHECKING:
     from rich.console import Console

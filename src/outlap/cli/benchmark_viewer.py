@@ -18,7 +18,7 @@ from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.cli.races import check_positive
 from outlap.processes import in_new_process
-from outlap.training.run import machine
+from outlap.provenance import machine
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -63,7 +63,7 @@ class Compare:
         from outlap.evaluation.results import prepare_folder
         from outlap.evaluation.rollout import evaluate, made_for, standing_starts
         from outlap.experiments.comparison import Subject, group, write_comparison
-        from outlap.training.run import provenance
+        from outlap.provenance import provenance
 
         check_least("--episodes", self.episodes, 1)
         check_least("--seed", self.seed, 0)

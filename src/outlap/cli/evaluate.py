@@ -159,7 +159,7 @@ def evaluate_into(
     from outlap.evaluation.metrics import summarise
     from outlap.evaluation.results import prepare_folder, save_results
     from outlap.evaluation.rollout import evaluate
-    from outlap.training.run import provenance
+    from outlap.provenance import provenance
 
     prepare_folder(folder)
     begun = time.monotonic()

@@ -171,7 +171,7 @@ def _recordings(names: Sequence[str]) -> list[Recording]:
 
 
 def _drawn(figure: Figure, out: Path) -> CommandResult:
-    from outlap.viewer.plots import save_figure
+    from outlap.figure_style import save_figure
 
     save_figure(figure, out)
     return CommandResult(

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from outlap.figure_style import save_figure
 from outlap.files import atomic_write
-from outlap.viewer.plots import save_figure
 
 
 class Document:

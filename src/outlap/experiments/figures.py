@@ -15,8 +15,7 @@ from matplotlib.lines import Line2D
 
 from outlap.evaluation.statistics import estimate_mean, performance_profile
 from outlap.experiments.results import METRICS, TableResult
-from outlap.viewer.colours import COLOURS, INK
-from outlap.viewer.plots import WIDTH, finish, new_figure
+from outlap.figure_style import COLOURS, INK, WIDTH, finish, new_figure
 
 RULES = {"none": "no clip", "fixed": "fixed clip", "abc": "ABC", "uniform": "β = 1"}
 RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uniform": COLOURS[7]}

@@ -30,7 +30,7 @@ from outlap.experiments.unit import done_record
 from outlap.experiments.units import COLLECTING_WORLDS, adaptation_settings
 from outlap.files import atomic_write, to_json
 from outlap.mql.propensity import CLIP_RULES
-from outlap.training.run import provenance
+from outlap.provenance import provenance
 
 APPENDIX_TITLES = {
     ("opponents", "vanilla-dr"): "Appendix B: Vanilla DR learns against opponents",

@@ -13,20 +13,17 @@ from __future__ import annotations
 import json
 import logging
 import os
-import platform
 import re
-import sys
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from outlap.config import read_yaml, save_config, validate
 from outlap.errors import OutlapError
 from outlap.files import atomic_write, replacing, to_json
+from outlap.provenance import provenance
 from outlap.training.model_file import load_model
 
 if TYPE_CHECKING:
@@ -36,7 +33,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CHECKPOINTS_KEPT = 3
-PACKAGES = ("outlap", "numpy", "numba", "torch", "stable-baselines3", "gymnasium")
 
 
 @dataclass(frozen=True)
@@ -176,29 +172,6 @@ def save_checkpoint(run: Run, model: Any, name: str, replay_name: str) -> Path:
     for old in (*run.checkpoints()[CHECKPOINTS_KEPT:], *(each for each in run.replays() if each != replay)):
         old.unlink(missing_ok=True)
     return path
-
-
-def provenance() -> Mapping[str, Any]:
-    """Where results come from: command, time, versions, machine."""
-    return {
-        "command": " ".join(["outlap", *sys.argv[1:]]),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
-        "machine": machine(),
-    }
-
-
-def machine() -> Mapping[str, Any]:
-    """What results were measured on."""
-    return {"system": platform.platform(), "processor": _processor(), "cores": os.cpu_count()}
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def _steps_of(checkpoint: Path) -> int:

@@ -18,10 +18,10 @@ from outlap.envs.race import EGO
 from outlap.errors import OutlapError
 from outlap.evaluation.recording import Recording, check_together
 from outlap.evaluation.statistics import estimate_mean
+from outlap.figure_style import COLOURS, INK, WIDTH, finish, new_figure
 from outlap.simulator.bicycle import GRAVITY
 from outlap.track.track import Track
-from outlap.viewer.colours import COLOURS, INK
-from outlap.viewer.plots import WIDTH, draw_walls, finish, new_figure, plain, view_of
+from outlap.viewer.plots import draw_walls, plain, view_of
 
 PANELS = 6  # of a figure, at most
 NEAR_THE_LIMIT = 0.8  # of the grip

@@ -4,35 +4,23 @@ from __future__ import annotations
 
 import math
 import os
-from pathlib import Path
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D, offset_copy
 
-from outlap.errors import OutlapError
-from outlap.files import replacing
+from outlap.figure_style import BLUE, INK, VERMILLION, WALL_GREY, WIDTH, finish, new_figure
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
-from outlap.viewer.colours import BLUE, INK, VERMILLION, WALL_GREY
 
 RACELINE_DASHES = (0, (4, 1.5))
 
-WIDTH = 7.0  # [inch] of the figure: the text width of a page
 MAX_MAP_PIXELS = 1600  # of the longer side of the drawn map
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size [inch] that can be saved without a display."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figure:
@@ -111,25 +99,6 @@ def draw_raceline(
 def plain(name: str) -> str:
     """A name as Matplotlib shows it and nothing else: a $ begins no formula."""
     return name.replace("$", r"\$")
-
-
-def finish(figure: Figure, path: str | os.PathLike[str] | None = None) -> Figure:
-    """Tidy the axes of a figure, and save it if there is a path."""
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(which="both", labelsize=7)
-    if path is not None:
-        save_figure(figure, path)
-    return figure
-
-
-def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure beside its place and rename it. Raises OutlapError for an ending that Matplotlib cannot write."""
-    ending = Path(path).suffix.lstrip(".").lower()
-    if ending not in figure.canvas.get_supported_filetypes():
-        raise OutlapError(f"{os.fspath(path)}: ending is {ending!r}; must be png, pdf or svg")
-    with replacing(path) as partial:
-        figure.savefig(partial, dpi=200)
 
 
 def view_of(track: Track) -> tuple[np.ndarray, np.ndarray]:

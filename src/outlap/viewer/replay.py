@@ -16,10 +16,10 @@ from PIL import Image
 
 from outlap.envs.frame import NO_ECHO, YAW
 from outlap.evaluation.recording import Recording, check_together
+from outlap.figure_style import COLOURS, WALL_GREY
 from outlap.files import atomic_write
 from outlap.simulator.lidar import beam_angles
 from outlap.track.track import Track
-from outlap.viewer.colours import COLOURS, WALL_GREY
 
 MAX_MAP_PIXELS = 2400  # of the longer side
 MAX_BEAMS = 180  # shown

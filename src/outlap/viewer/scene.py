@@ -12,9 +12,9 @@ import numpy as np
 from outlap.envs.frame import SPEED, STEER, YAW, Cast, Frame, X, Y
 from outlap.envs.race import EGO
 from outlap.errors import OutlapError
+from outlap.figure_style import COLOURS, INK, WALL_GREY
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, REMOVED
 from outlap.track.track import Track
-from outlap.viewer.colours import COLOURS, INK, WALL_GREY
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")  # Ctrl-C and a kill stay what they are

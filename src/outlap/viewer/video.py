@@ -12,9 +12,9 @@ from PIL import Image
 
 from outlap.errors import OutlapError
 from outlap.evaluation.recording import Recording, check_together
+from outlap.figure_style import COLOURS
 from outlap.files import replacing
 from outlap.track.track import Track
-from outlap.viewer.colours import COLOURS
 from outlap.viewer.scene import CRASH_RED, RACELINE, Entry, Scene, mixed_with_white
 
 View = Literal["follow", "track"]
