@@ -7,10 +7,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff
-
+from outlap.cli.command import Flag, LongCommand
 from outlap.cli.output import CommandResult
-from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
 from outlap.processes import in_new_process
 from outlap.provenance import machine
@@ -25,7 +23,7 @@ PLANS = 64  # random commands and starts made beforehand
 
 
 @dataclass(frozen=True)
-class BenchmarkSimulator:
+class BenchmarkSimulator(LongCommand):
     """Measure physics steps with their scans per second, every core at work.
 
     Random driving: each car holds a steering angle within 0.2 rad and a speed within 8 m/s for 10 steps. A
@@ -56,12 +54,6 @@ class BenchmarkSimulator:
     repeats: int = 3
     """Measurements of each case; the median is reported, with the fastest and the slowest."""
 
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         if (self.cars is None) != (self.beams is None):
             raise OutlapError("--cars and --beams go together: give both for one case, or neither for the usual four")
@@ -69,7 +61,7 @@ class BenchmarkSimulator:
             raise OutlapError("--worlds and --repeats must be at least 1 and --seconds more than 0")
         cases = CASES if self.cars is None or self.beams is None else ((self.cars, self.beams),)
         rows = []
-        with progress_bar("benchmark", len(cases), "cases", self.quiet) as update:
+        with self.progress("benchmark", len(cases), "cases") as update:
             for cars, beams in cases:
                 # A process of its own each, so that its peak of memory is its own.
                 rows.append(in_new_process(_measure, self, cars, beams))
@@ -174,7 +166,7 @@ FILLED = 60  # actions of every world in the replay before anything is measured
 
 
 @dataclass(frozen=True)
-class BenchmarkMQL:
+class BenchmarkMQL(LongCommand):
     """Measure updates of Meta-Q-Learning, and a training as a whole.
 
     `update_ms` is the time of one update: a batch gathered from the replay, both losses, every second time the
@@ -199,12 +191,6 @@ class BenchmarkMQL:
     device: str = "cpu"
     """Of the networks: cpu, cuda, cuda:1, or auto for a GPU if there is one."""
 
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         given = (self.preset, self.beams, self.batch)
         if any(each is None for each in given) and any(each is not None for each in given):
@@ -214,7 +200,7 @@ class BenchmarkMQL:
         check_device(self.device)
         cases = MQL_CASES if self.preset is None else (given,)
         rows = []
-        with progress_bar("benchmark", len(cases), "cases", self.quiet) as update:
+        with self.progress("benchmark", len(cases), "cases") as update:
             for preset, beams, batch in cases:
                 rows.append(in_new_process(_measure_mql, self, preset, beams, batch))
                 update(len(rows), f"{preset}, {beams} beams, batch {batch}")
@@ -283,7 +269,7 @@ def _print_mql(console: Console, rows: list[dict[str, Any]]) -> None:
 
 
 @dataclass(frozen=True)
-class BenchmarkRacing:
+class BenchmarkRacing(LongCommand):
     """Measure races against opponents: actions of the first car per second, simulator and opponents together.
 
     The first car holds random actions; its episode begins anew when it crashes, and the time for that counts.
@@ -292,7 +278,7 @@ class BenchmarkRacing:
     opponents: tuple[str, ...] = ("population",)
     """Drivers and populations; the training half of the one that comes with outlap by default."""
 
-    opponent_code: FlagCreatePairsOff[bool] = False
+    opponent_code: Flag = False
     """Import modules for opponents, module:function, which runs their code."""
 
     worlds: int = 128
@@ -316,17 +302,11 @@ class BenchmarkRacing:
     repeats: int = 3
     """Measurements; the median is reported, with the fastest and the slowest."""
 
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         if self.worlds < 1 or self.cars < 2 or self.seconds <= 0 or self.repeats < 1:
             raise OutlapError("--cars must be at least 2, --worlds and --repeats at least 1, and --seconds more than 0")
         begun, expected = time.monotonic(), round((1 + self.repeats) * self.seconds)
-        with progress_bar("benchmark", expected, "seconds", self.quiet) as update:
+        with self.progress("benchmark", expected, "seconds") as update:
             row = in_new_process(_measure_racing, self, on_wait=lambda: update(int(time.monotonic() - begun), ""))
         data = {"rows": [row], "machine": machine()}
         return CommandResult(data, lambda console: _print_racing(console, row))
@@ -368,5 +348,4 @@ def _print_racing(console: Console, row: dict[str, Any]) -> None:
         f"{row['worlds']} races of {row['cars']} cars, {row['beams']} beams, {len(row['opponents'])} opponents to draw "
         f"from: {row['ego_steps_per_second']:,} actions of the first car a second "
         f"({row['slowest_ego_steps_per_second']:,} … {row['fastest_ego_steps_per_second']:,})",
-        highlight=False,
     )

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult
-from outlap.cli.progress import progress_bar
 from outlap.provenance import machine
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class BenchmarkCar:
+class BenchmarkCar(LongCommand):
     """Measure how long an exported policy takes for a command, from a raw scan of 1,081 ranges, on one core."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
@@ -28,12 +28,6 @@ class BenchmarkCar:
 
     commands: int = 5_000
     """To measure."""
-
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.deploy.car_driver import CarDriver
@@ -43,7 +37,7 @@ class BenchmarkCar:
         rng = np.random.default_rng(0)
         scans = rng.uniform(0.5, 12.0, (64, 1081)).astype(np.float32)
         taken = np.empty(self.commands)
-        with progress_bar("benchmark", self.commands, "commands", self.quiet) as update:
+        with self.progress("benchmark", self.commands, "commands") as update:
             for number in range(-100, self.commands):  # the first ones warm up
                 scan = scans[number % len(scans)]
                 begun = time.perf_counter()
@@ -57,7 +51,7 @@ class BenchmarkCar:
 
         def show(console: Console) -> None:
             words = ", ".join(f"{name.removesuffix('_ms')} {value} ms" for name, value in milliseconds.items())
-            console.print(f"{words}, of {self.commands:,} commands", highlight=False)
+            console.print(f"{words}, of {self.commands:,} commands")
 
         return CommandResult(data, show)
 

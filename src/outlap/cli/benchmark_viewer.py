@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult
-from outlap.cli.progress import progress_bar
 from outlap.cli.races import check_positive
 from outlap.processes import in_new_process
 from outlap.provenance import machine
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class BenchmarkViewer:
+class BenchmarkViewer(LongCommand):
     """Measure the viewers on a race: in a window that nobody sees, as a video, as a replay.
 
     In the window the race is simulated too, as `outlap watch` does; pictures follow one another without a pause, until
@@ -51,19 +50,13 @@ class BenchmarkViewer:
     size: tuple[int, int] = (1280, 720)
     """Of the pictures, width and height in pixels."""
 
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         check_least("--cars", self.cars, 2)
         check_least("--beams", self.beams, 1)
         check_least("--size", min(self.size), 64)
         check_positive("--seconds", self.seconds)
         row: dict[str, Any] = {}
-        with progress_bar("benchmark", len(MEASUREMENTS), "cases", self.quiet) as update:
+        with self.progress("benchmark", len(MEASUREMENTS), "cases") as update:
             for number, measure in enumerate(MEASUREMENTS, start=1):
                 row |= in_new_process(measure, self)
                 update(number, measure.__name__.removeprefix("_measure_"))
@@ -138,4 +131,4 @@ def _print(console: Console, row: dict[str, Any]) -> None:
         f"replay: {row['replay_bytes'] / 1e6:.2f} MB for {row['race_s']} s, written in {row['replay_s']} s",
     )
     for line in lines:
-        console.print(line, highlight=False)
+        console.print(line)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult
-from outlap.cli.progress import progress_bar
 from outlap.cli.races import find_subject, held_out_tracks, unused
 from outlap.errors import OutlapError
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Compare:
+class Compare(LongCommand):
     """Race runs on the same episodes and say what the differences show, with their intervals.
 
     All are compared with the first. Runs that differ in nothing but their seed are trainings of one method; with two
@@ -50,12 +50,6 @@ class Compare:
     out: Path | None = None
     """A new or empty folder for the report; by default runs/compare-TIME."""
 
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         import pandas as pd
 
@@ -81,7 +75,7 @@ class Compare:
         groups = group(subjects)
         rows = []
         total = len(subjects) * len(tracks) * self.episodes
-        with progress_bar("racing", total, "episodes", self.quiet) as update:
+        with self.progress("racing", total, "episodes") as update:
             for method, members in groups.items():
                 for subject in members:
                     before = len(rows) * len(tracks) * self.episodes
@@ -98,5 +92,5 @@ class Compare:
 
 
 def _print(console: Console, data: Mapping[str, Any], folder: Path) -> None:
-    console.print((folder / "report.md").read_text(), highlight=False, markup=False, soft_wrap=True)
-    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+    console.print((folder / "report.md").read_text())
+    console.print(f"report: {folder / 'report.html'}")

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import Flag, LongCommand
 from outlap.cli.interrupts import NOTHING_KEPT
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
-from outlap.cli.races import Flag, RaceFlags, check_positive, held_out_tracks, is_run, unused
+from outlap.cli.races import RaceFlags, check_positive, held_out_tracks, is_run, unused
 from outlap.cli.recordings import RECORDINGS, record_episodes, with_recordings
 from outlap.errors import OutlapError
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(RaceFlags):
+class Evaluate(RaceFlags, LongCommand):
     """Race a driver on tracks, from a standstill anywhere on the lap, and measure it.
 
     The episodes are settled in advance by --seed, the same ones for every driver. The car is that of the
@@ -67,12 +68,6 @@ class Evaluate(RaceFlags):
     out: Path | None = None
     """A new or empty folder for the results; by default RUN/evaluations/TIME."""
 
-    quiet: Flag = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         self._check_flags()
         from outlap.envs.tasks import load_tracks
@@ -103,7 +98,7 @@ class Evaluate(RaceFlags):
         if not self.record:
             return result
         number = min(self.record, self.episodes)
-        with progress_bar("recording", number * len(tracks), "episodes", self.quiet) as update:
+        with self.progress("recording", number * len(tracks), "episodes") as update:
             done: list[Path] = []
 
             def recorded(path: Path) -> None:
@@ -204,7 +199,6 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
     each = next(iter(data["tracks"].values()))["episodes"]
     console.print(
         f"{data['driver']}: {each} episodes on each track, {data['all']['episodes']} in all",
-        highlight=False, markup=False,
     )  # fmt: skip
     for columns in (DRIVING, RACING, EPISODES):
         console.print()
@@ -212,19 +206,17 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
     console.print()
     console.print(
         "mean ± sd over episodes, [95 % interval of the mean]",
-        style="dim", highlight=False, markup=False,
+        style="dim",
     )  # fmt: skip
     if (error := data["all"]["min_lap_error"]) is not None:
         exact = f", too long by up to {100.0 * error:.2f} % for two cars drawn at random" if error else ""
         console.print(
             f"lap / least: lap time over the minimum-time lap of the same track and vehicle{exact}",
-            style="dim", highlight=False, markup=False,
+            style="dim",
         )  # fmt: skip
     if trained_on:
-        console.print(
-            f"* trained on {', '.join(trained_on)}: not a result on unseen tracks", highlight=False, markup=False
-        )
-    console.print(f"results: {data['folder']}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"* trained on {', '.join(trained_on)}: not a result on unseen tracks")
+    console.print(f"results: {data['folder']}")
 
 
 DRIVING = ("crash_rate", "completed_laps", "lap_time_s", "lap_time_ratio", "mean_speed_mps")

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult, check_output_path
-from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ LARGEST_DIFFERENCE = 1e-5  # of an action, between the file and the policy
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(LongCommand):
     """Write a trained policy as one ONNX file for a car, and check that it does what the policy does.
 
     Scaling, history, networks and what actions mean are inside; `outlap.deploy.CarDriver` drives with it.
@@ -36,12 +36,6 @@ class Export:
     steps: int = 1000
     """Actions of a race in the training's environment on which both are compared."""
 
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         from outlap.deploy.car_driver import CarDriver
         from outlap.deploy.export import compare, export_policy
@@ -51,7 +45,7 @@ class Export:
         path = self.out or self.run_folder / "policy.onnx"
         check_output_path(path, (".onnx",))
         run = load_run(self.run_folder)
-        with progress_bar("exporting", self.steps, "steps compared", self.quiet) as update:
+        with self.progress("exporting", self.steps, "steps compared") as update:
             facts = export_policy(run, path)
             of_action, of_command = compare(
                 run, CarDriver(path), self.steps, on_step=lambda done: update(done, "") if done % 50 == 0 else None
@@ -75,6 +69,6 @@ class Export:
                 f"on {self.steps:,} steps no action differs from the policy's by more than {of_action:.1g}",
             )
             for line in lines:
-                console.print(line, highlight=False, markup=False, soft_wrap=True)
+                console.print(line)
 
         return CommandResult(data, show)

@@ -14,32 +14,23 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from outlap.cli.interrupts import INTERRUPTED, ctrl_c_spares_imports, end_now
 from outlap.cli.output import (
     STANDARD_OUTPUT,
-    CommandResult,
     check_json_path,
     deliver,
     standard_output_kept_clean,
 )
 from outlap.errors import OutlapError
 
+if TYPE_CHECKING:
+    from outlap.cli.command import Command
+
 # A full disk, a quota, a file system or a folder that cannot be written: no bugs.
 STORAGE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.ENOTDIR)
 DONE, BAD_INPUT, OUTPUT_CLOSED = 0, 2, 141
-
-
-class Command(Protocol):
-    """A dataclass whose fields are the flags; tyro builds it.
-
-    Progress and logs go to standard error. A class with `from_config(path)` also takes `--config FILE`.
-    """
-
-    json: str | None
-
-    def run(self) -> CommandResult: ...
 
 
 class Entry(NamedTuple):

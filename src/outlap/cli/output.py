@@ -100,7 +100,13 @@ def _result_console() -> Console:
     from rich.console import Console
 
     class ResultConsole(Console):
+        """Print text as it is: paths are never broken, brackets are no markup. Tables fit the terminal."""
+
+        def print(self, *objects: Any, **options: Any) -> None:
+            options.setdefault("soft_wrap", all(isinstance(each, str) for each in objects))
+            super().print(*objects, **options)
+
         def on_broken_pipe(self) -> None:
             raise  # rich calls this while it handles the error, and would exit with 1; main decides
 
-    return ResultConsole()
+    return ResultConsole(highlight=False, markup=False, emoji=False)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
+from outlap.cli.command import Command, LongCommand
 from outlap.cli.output import CommandResult, check_output_path
 from outlap.cli.recordings import EpisodeFlags, Episodes, recording_files
 from outlap.errors import OutlapError
@@ -24,19 +25,13 @@ PICTURES = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _EpisodePlot(EpisodeFlags):
+class _EpisodePlot(EpisodeFlags, LongCommand):
     names: Episodes
     """Recordings of `outlap evaluate --record` or `outlap adapt --record`, folders of them, or drivers, which race one
     episode now."""
 
     out: Path = Path("plot.png")
     """The picture: .png, .pdf or .svg."""
-
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +59,7 @@ class PlotFriction(_EpisodePlot):
 
 
 @dataclass(frozen=True)
-class PlotContexts:
+class PlotContexts(Command):
     """Draw what a policy's context tells of the task: principal components, and how tasks are confused.
 
     A task is a track, or what recordings of one track are called.
@@ -76,9 +71,6 @@ class PlotContexts:
     out: Path = Path("plot.png")
     """The picture: .png, .pdf or .svg."""
 
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         from outlap.viewer.episode_plots import draw_contexts
 
@@ -87,7 +79,7 @@ class PlotContexts:
 
 
 @dataclass(frozen=True)
-class PlotLapTimes:
+class PlotLapTimes(Command):
     """Draw lap times over the least possible, by track: of the folders that `outlap evaluate` leaves."""
 
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER")]
@@ -95,9 +87,6 @@ class PlotLapTimes:
 
     out: Path = Path("plot.png")
     """The picture: .png, .pdf or .svg."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         import pandas as pd
@@ -117,7 +106,7 @@ class PlotLapTimes:
 
 
 @dataclass(frozen=True)
-class PlotLearning:
+class PlotLearning(Command):
     """Draw learning curves: return and crash rate over the actions of trainings.
 
     Runs that differ in nothing but their seed are one curve, with the 95 % interval of its mean.
@@ -128,9 +117,6 @@ class PlotLearning:
 
     out: Path = Path("plot.png")
     """The picture: .png, .pdf or .svg."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.experiments.figures import draw_learning, read_learning
@@ -174,6 +160,4 @@ def _drawn(figure: Figure, out: Path) -> CommandResult:
     from outlap.figure_style import save_figure
 
     save_figure(figure, out)
-    return CommandResult(
-        {"file": out}, lambda console: console.print(str(out), highlight=False, markup=False, soft_wrap=True)
-    )
+    return CommandResult({"file": out}, lambda console: console.print(str(out)))

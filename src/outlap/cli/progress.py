@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 SECONDS_BETWEEN_LINES = 15.0
+Update = Callable[[int, str], None]  # (done, note), to be called as often as is convenient
 
 
 @contextmanager
-def progress_bar(what: str, total: int, unit: str, quiet: bool = False) -> Iterator[Callable[[int, str], None]]:
+def progress_bar(what: str, total: int, unit: str, quiet: bool = False) -> Iterator[Update]:
     """Show how far work has come.
-
-    Yields a function (done, note) to call as often as is convenient.
 
     Args:
         what: the work, in a word or two.
@@ -30,7 +29,7 @@ def progress_bar(what: str, total: int, unit: str, quiet: bool = False) -> Itera
         yield _lines(what, total, unit)
 
 
-def _bar(what: str, total: int, unit: str) -> Iterator[Callable[[int, str], None]]:
+def _bar(what: str, total: int, unit: str) -> Iterator[Update]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -52,7 +51,7 @@ def _bar(what: str, total: int, unit: str) -> Iterator[Callable[[int, str], None
         yield update
 
 
-def _lines(what: str, total: int, unit: str) -> Callable[[int, str], None]:
+def _lines(what: str, total: int, unit: str) -> Update:
     latest, over = time.monotonic(), False
 
     def update(done: int, note: str) -> None:

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional
+from tyro.conf import Positional
 
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult
 from outlap.errors import OutlapError
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class PlanRaceline:
+class PlanRaceline(LongCommand):
     """Plan the fastest line around a track for a car: an F1TENTH raceline csv, a picture, and its lap time."""
 
     track: Positional[str]
@@ -53,12 +54,6 @@ class PlanRaceline:
 
     out: Path | None = None
     """The csv; NAME_raceline.csv here by default. The picture goes beside it, as .png. Older ones are replaced."""
-
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.planning.friction import FrictionMap
@@ -109,12 +104,11 @@ class PlanRaceline:
                 f"{track.name}, {line.method}: {line.lap_time:.2f} s for {line.path.length:.1f} m, "
                 f"{line.speed.min():.1f} to {line.speed.max():.1f} m/s; at least {line.min_margin:.2f} m from the "
                 f"walls; planned in {line.solve_time:.1f} s",
-                highlight=False, markup=False, soft_wrap=True,
             )  # fmt: skip
             if track.raceline is not None:
-                console.print(f"the track's own raceline: {track.raceline.lap_time:.2f} s", highlight=False)
+                console.print(f"the track's own raceline: {track.raceline.lap_time:.2f} s")
             for what, path in (("raceline", out), ("picture", picture)):
-                console.print(f"{what}: {path}", highlight=False, markup=False, soft_wrap=True)
+                console.print(f"{what}: {path}")
 
         return CommandResult(data, show)
 

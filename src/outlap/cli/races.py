@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff
-
 from outlap.cli.arguments import check_least
+from outlap.cli.command import Flag
 from outlap.drivers.find import find_drivers
 from outlap.errors import OutlapError
 
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from outlap.drivers.driver import Driver
     from outlap.envs.race_config import RaceConfig
     from outlap.training.run import Run
-
-Flag = FlagCreatePairsOff[bool]
 
 
 @dataclass(frozen=True, kw_only=True)

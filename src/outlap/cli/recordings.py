@@ -62,7 +62,7 @@ def with_recordings(result: CommandResult, folder: Path, track: Track) -> Comman
 
     def show(console: Console) -> None:
         result.show(console)
-        console.print(f"look at it: outlap replay {first}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"look at it: outlap replay {first}")
 
     return CommandResult({**result.data, "recordings": place}, show)
 
@@ -196,10 +196,8 @@ def shown(recordings: list[Recording], path: Path, seconds: float | None = None)
 
     def show(console: Console) -> None:
         for race in data["races"]:
-            console.print(
-                f"{race['title']}: {race['outcome']} after {race['seconds']} s", highlight=False, markup=False
-            )
+            console.print(f"{race['title']}: {race['outcome']} after {race['seconds']} s")
         took = "" if seconds is None else f", drawn in {seconds:.1f} s"
-        console.print(f"{path} ({data['bytes'] / 1e6:.2f} MB{took})", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"{path} ({data['bytes'] / 1e6:.2f} MB{took})")
 
     return CommandResult(data, show)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tyro.conf import FlagCreatePairsOff
-
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult, check_output_path
 from outlap.cli.recordings import EpisodeFlags, Episodes, shown
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay(EpisodeFlags):
+class Replay(EpisodeFlags, LongCommand):
     """Write races as one HTML file that plays in any browser, and needs nothing else.
 
     Several are laid over one another or shown side by side: before and after an adaptation, one driver and another.
@@ -27,12 +26,6 @@ class Replay(EpisodeFlags):
 
     title: str = ""
     """Of the page; by default the drivers' names."""
-
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.viewer.replay import write_replay

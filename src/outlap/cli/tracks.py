@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
+from outlap.cli.command import Command, Flag
 from outlap.cli.output import CommandResult
 from outlap.errors import OutlapError
 
@@ -16,18 +17,13 @@ if TYPE_CHECKING:
 
     from outlap.track import Track
 
-Flag = FlagCreatePairsOff[bool]
-
 
 @dataclass(frozen=True)
-class ListTracks:
+class ListTracks(Command):
     """List every track that can be used by its name.
 
     They come from the folders of OUTLAP_TRACKS, the cache (downloaded or imported), and the built-in set.
     """
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.track.catalog import list_tracks
@@ -47,7 +43,7 @@ class ListTracks:
 
 
 @dataclass(frozen=True)
-class ShowTrack:
+class ShowTrack(Command):
     """Draw a track: its map, its centreline and the curvature along it."""
 
     track: Positional[str]
@@ -55,9 +51,6 @@ class ShowTrack:
 
     out: Path | None = None
     """The picture; NAME.png here by default. An older one is replaced."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.track import Track
@@ -83,7 +76,7 @@ class ShowTrack:
 
 
 @dataclass(frozen=True)
-class GenerateTrack:
+class GenerateTrack(Command):
     """Make a random closed circuit and write it as an F1TENTH map folder; a seed always gives the same."""
 
     seed: int
@@ -110,9 +103,6 @@ class GenerateTrack:
     name: str | None = None
     """The track's name; by default that of the folder, or generated-SEED."""
 
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         from outlap.track.generate import generate_track
 
@@ -134,7 +124,7 @@ class GenerateTrack:
 
 
 @dataclass(frozen=True)
-class ImportTrack:
+class ImportTrack(Command):
     """Check an F1TENTH map folder or a TUM centreline csv and store it, so that its name finds it."""
 
     source: Positional[Path]
@@ -154,9 +144,6 @@ class ImportTrack:
 
     force: Flag = False
     """Replace a track that is there already."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.track.cache import cache_folder, install, staging
@@ -190,7 +177,7 @@ class ImportTrack:
 
 
 @dataclass(frozen=True)
-class DownloadTracks:
+class DownloadTracks(Command):
     """Get circuits from the official F1TENTH archive into the cache, so that their names find them.
 
     The SHA-256 of each is kept in tracks.lock.json in the cache; a later download must be the same bytes.
@@ -207,9 +194,6 @@ class DownloadTracks:
 
     url: str = "https://api.f1tenth.org/{name}.tar.xz"
     """Of a mirror, with {name}; https only."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.track.catalog import OFFICIAL_TRACKS
@@ -290,7 +274,7 @@ def _written(track: Track, folder: Path, kind: str) -> CommandResult:
     def show(console: Console) -> None:
         _print_summary(console, data)
         _print(console, f"written to: {folder}")
-        console.print(f"to see it: outlap tracks show '{usable_as}'", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"to see it: outlap tracks show '{usable_as}'")
         if note:
             _print(console, note)
 
@@ -323,4 +307,4 @@ def _print_summary(console: Console, data: dict[str, Any]) -> None:
 
 def _print(console: Console, line: str) -> None:
     """One line as it is: a path is never broken, and brackets in it are not markup."""
-    console.print(line, markup=False, highlight=False, soft_wrap=True)
+    console.print(line)

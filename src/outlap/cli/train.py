@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import arg
 
+from outlap.cli.command import LongCommand
 from outlap.cli.interrupts import NOTHING_KEPT
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _Train:
+class _Train(LongCommand):
     """What the trainings of all algorithms have in common; each says what its `settings` are."""
 
     config_class: ClassVar[type[TrainingConfig]]
@@ -41,12 +42,6 @@ class _Train:
 
     resume: Path | None = None
     """Continue this run, with its own configuration, from its newest checkpoint."""
-
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     @classmethod
     def from_config(cls, path: Path) -> Self:
@@ -138,9 +133,8 @@ def training_result(run: Run) -> CommandResult:
     def show(console: Console) -> None:
         console.print(
             f"trained {data['steps']:,} steps in {data['seconds']} s ({data['env_steps_per_second']:,} steps/s)",
-            highlight=False,
         )
-        console.print(f"run folder: {run.folder}", highlight=False, soft_wrap=True)
-        console.print(f"evaluate it: outlap evaluate {run.folder}", highlight=False, soft_wrap=True)
+        console.print(f"run folder: {run.folder}")
+        console.print(f"evaluate it: outlap evaluate {run.folder}")
 
     return CommandResult(data, show)

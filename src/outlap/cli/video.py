@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from tyro.conf import FlagCreatePairsOff
-
 from outlap.cli.arguments import check_least
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult, check_output_path
-from outlap.cli.progress import progress_bar
 from outlap.cli.races import check_positive
 from outlap.cli.recordings import EpisodeFlags, Episodes, shown
 from outlap.errors import OutlapError
@@ -20,7 +18,7 @@ STILL = ".png"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Video(EpisodeFlags):
+class Video(EpisodeFlags, LongCommand):
     """Write races as a video (.mp4), an animated picture (.gif) or a still one (.png). Needs no display."""
 
     names: Episodes
@@ -44,12 +42,6 @@ class Video(EpisodeFlags):
     at: float | None = None
     """[s] of the race that a .png shows; by default its end."""
 
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         from outlap.viewer.video import ENDINGS, check_video, count_pictures, write_picture, write_video
 
@@ -69,7 +61,7 @@ class Video(EpisodeFlags):
             )
         begun = time.monotonic()
         count = count_pictures(recordings, self.fps, self.speed)
-        with progress_bar("drawing", count, "pictures", self.quiet) as update:
+        with self.progress("drawing", count, "pictures") as update:
             path = write_video(
                 recordings, track, self.out, size=self.size, frames_per_second=self.fps, view=self.view,
                 speed=self.speed, on_progress=lambda done: update(done, ""),

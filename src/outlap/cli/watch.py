@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import Command
 from outlap.cli.output import CommandResult
 from outlap.cli.races import RaceFlags, check_positive, held_out_tracks
 
@@ -16,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class WatchRaces(RaceFlags):
+class WatchRaces(RaceFlags, Command):
     """Watch a driver race in a window, or take the wheel of any car: h lists the keys.
 
     Episodes follow one another, from --seed on, until the window is closed.
@@ -36,9 +37,6 @@ class WatchRaces(RaceFlags):
 
     size: tuple[int, int] = (1280, 720)
     """Of the window, width and height in pixels."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.evaluation.rollout import standing_starts
