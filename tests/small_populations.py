@@ -19,7 +19,10 @@ def driver(seed: int = 0, name: str = "one", *, beams: int = 24, speeds: tuple[f
     shapes = [(beams + 5, 16), (16, 16), (16, 2)]
     weights = tuple(rng.normal(0, 0.3, shape).astype(np.float32) for shape in shapes)
     biases = tuple(rng.normal(0, 0.3, shape[1]).astype(np.float32) for shape in shapes)
-    return MLPDriver(name, {"scan": beams, "vel": 3, "heading": 2}, True, speeds, "tanh", weights, biases)
+    return MLPDriver(
+        name=name, sizes={"scan": beams, "vel": 3, "heading": 2}, scale_observations=True, speeds=speeds,
+        activation="tanh", weights=weights, biases=biases,
+    )  # fmt: skip
 
 
 def ring_driver(
@@ -28,7 +31,9 @@ def ring_driver(
     """A perceptron of one layer that follows the centreline of a ring with a constant action for its speed."""
     weights = np.array([[-0.3 / STEER_STOP, 0.0], [-0.9 / STEER_STOP, 0.0]], np.float32)  # of offset, heading error
     bias = np.array([math.atan(0.33 / radius) / STEER_STOP, speed_action], np.float32)
-    return MLPDriver(name, {"frenet": 2}, False, speeds, "tanh", (weights,), (bias,))
+    return MLPDriver(
+        name=name, sizes={"frenet": 2}, speeds=speeds, activation="tanh", weights=(weights,), biases=(bias,)
+    )
 
 
 def save_population(folder: Path, *halves: tuple[MLPDriver, Split], track: str = "ring") -> Path:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from outlap.drivers.mlp import DriverStack, MLPDriver
+from outlap.drivers.mlp import MLPDriver, MLPStack
 from outlap.drivers.population import load_population, read_manifest, write_manifest
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
@@ -36,11 +36,11 @@ def test_a_stack_gives_each_car_its_own_drivers_action() -> None:
     drivers = [driver(seed) for seed in range(4)]
     which = np.array([3, 0, 0, 1, 3, 3, 0])  # nobody asks for 2
     seen = observations(7)
-    together = DriverStack(drivers).act(which, seen)
+    together = MLPStack(drivers).act(which, seen)
     for i, number in enumerate(which):
         alone = drivers[number].act({name: value[i : i + 1] for name, value in seen.items()})
         np.testing.assert_allclose(together[i], alone[0], atol=1e-6)
-    assert DriverStack(drivers).act(np.zeros(0, np.int64), observations(0)).shape == (0, 2)
+    assert MLPStack(drivers).act(np.zeros(0, np.int64), observations(0)).shape == (0, 2)
 
 
 def test_an_action_does_not_depend_on_the_cars_beside_it_by_a_single_bit() -> None:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from outlap.drivers import Driver
 from outlap.envs.opponents import Opponents
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 
 
-class Scripted:
+class Scripted(Driver):
     """Always the same action; notes what it was asked."""
 
     observation_terms = ("frenet",)
-    scale_observations = False
 
     def __init__(self, name: str, action) -> None:
         self.name, self.action = name, action

@@ -11,6 +11,7 @@ import pytest
 from pandas.testing import assert_frame_equal
 
 from outlap.drivers.centerline_follower import CenterlineFollower
+from outlap.drivers.driver import Driver
 from outlap.drivers.function import FunctionDriver
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig, StartConfig
@@ -334,10 +335,10 @@ def test_no_yardstick_is_asked_for_or_can_be_planned(caplog, monkeypatch):
     assert "no lap_time_ratio: track ring5: at s = " in caplog.text
 
 
-class Listener:
+class Listener(Driver):
     """Drives like the follower, and keeps what it hears of rewards."""
 
-    name, scale_observations = "listener", False
+    name = "listener"
 
     def __init__(self, reward: RewardConfig | None) -> None:
         self.follower, self.reward = follower(), reward

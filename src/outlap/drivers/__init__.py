@@ -1,0 +1,5 @@
+"""Drivers: observations to actions."""
+
+from outlap.drivers.driver import Driver
+
+__all__ = ["Driver"]

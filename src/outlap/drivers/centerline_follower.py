@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from outlap.drivers.driver import Driver
+
 WHEELBASE = 0.33  # [m] of a 1:10 car
 STEER_STOP = 0.4189  # [rad]
 
 
 @dataclass(frozen=True)
-class CenterlineFollower:
+class CenterlineFollower(Driver):
     """Steers with the curvature just ahead, corrected by offset and heading error.
 
     The linear feedback is that of a point `1 / offset_gain` long pursuit: stable on any track wide enough for a
@@ -23,10 +25,6 @@ class CenterlineFollower:
     heading_gain: float = 0.9  # [-]
     name: str = "centerline-follower"
     observation_terms: tuple[str, ...] = ("frenet", "curvature_ahead")
-    scale_observations: bool = False
-
-    def begin(self, cars: np.ndarray) -> None:
-        """See `Driver.begin`; it remembers nothing."""
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See `Driver.act`."""

@@ -1,32 +1,58 @@
-"""What can sit in a car."""
+"""Driver: decides for the cars that it sits in."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    import gymnasium as gym
 
-class Driver(Protocol):
-    """Decides for a batch of cars. It knows observations, never an environment."""
+    from outlap.config import Config
 
-    @property
-    def name(self) -> str: ...
 
-    @property
-    def observation_terms(self) -> tuple[str, ...]:
-        """Names of `envs.observations.OBSERVATION_TERMS`."""
-        ...
+class Driver(ABC):
+    """Map the observations of a batch of cars to actions. A driver knows observations, never an environment.
 
-    @property
-    def scale_observations(self) -> bool:
-        """Whether terms are to be divided by their scale."""
-        ...
+    A subclass sets `name` and `observation_terms`, implements `act`, and overrides what else it has.
+    """
+
+    name: str
+    observation_terms: tuple[str, ...]  # names in `envs.observations.OBSERVATION_TERMS`
+    scale_observations: bool = False  # whether each term is divided by its scale
+    beams: int | None = None  # of the scan that it needs; None: any number
+    speeds: tuple[float, float] | None = None  # [m/s] that its actions -1 and 1 command; None: those of the car
+    reward: Config | None = None  # the RewardConfig whose rewards it observes; None: the task's
+    architecture: Hashable = None  # drivers of equal architectures can be stacked; None: this one cannot
 
     def begin(self, cars: np.ndarray) -> None:
-        """Hear which cars begin an episode with the next observation: bool (n,). Forget what was before."""
-        ...
+        """Forget the past of cars whose episode begins with the next observation: bool (n,)."""
+        return
 
+    @abstractmethod
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """Actions in [-1, 1]: (n, 2) steer, speed, from observations (n, size) of n cars."""
-        ...
+        """Return actions in [-1, 1], (n, 2) steer and speed, for observation terms (n, size) of n cars."""
+
+    def context(self) -> np.ndarray | None:
+        """Return the context behind the last actions, (n, hidden), for a driver that infers one."""
+        return None
+
+    def check(self, space: gym.Space) -> None:
+        """Raise OutlapError if observations of a space are not those that the driver needs."""
+        return
+
+    @classmethod
+    def stack(cls, drivers: Sequence[Any]) -> DriverStack:
+        """Return drivers of one `architecture` as one batch."""
+        raise NotImplementedError(f"{cls.__name__} has no architecture")
+
+
+class DriverStack(ABC):
+    """Drivers without memory that act together, in one batch."""
+
+    @abstractmethod
+    def act(self, which: np.ndarray, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return actions (n, 2) of n cars, given the number of each car's driver, int (n,)."""

@@ -18,7 +18,7 @@ from outlap.drivers.population import MANIFEST, SHIPPED, Split, load_population
 from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.errors import OutlapError
 
-UNTRAINED = {driver.name: driver for driver in (CenterlineFollower, PurePursuit, FollowTheGap)}
+UNTRAINED: dict[str, type[Driver]] = {driver.name: driver for driver in (CenterlineFollower, PurePursuit, FollowTheGap)}
 POPULATION = "population"  # the name of the one that comes with outlap
 OFFERED = (
     f"{', '.join(UNTRAINED)}, {POPULATION}, a population's folder or one of its members, a recorded lap (.csv), "
@@ -44,10 +44,8 @@ def find_drivers(
 
 
 def driver_name(driver: Named) -> str:
-    """What a configuration calls a driver: its name, or the name or path that was given."""
-    if isinstance(driver, (str, os.PathLike)):
-        return os.fspath(driver)
-    return getattr(driver, "name", None) or getattr(driver, "__name__", type(driver).__name__)
+    """Return what a configuration calls a driver: its name, or the name or path that was given."""
+    return os.fspath(driver) if isinstance(driver, (str, os.PathLike)) else _as_driver(driver, "driver").name
 
 
 def _drivers(name: Named, field_of_view: float, split: Split | None, run_code: bool) -> Sequence[Driver]:
@@ -100,6 +98,8 @@ def _function(module: str, function: str) -> Driver:
 
 def _as_driver(found: Any, where: str) -> Driver:
     """A driver as it is, a function as a driver; a class is neither."""
-    if isinstance(found, type) or not (hasattr(found, "act") or callable(found)):
+    if isinstance(found, Driver):
+        return found
+    if isinstance(found, type) or not callable(found):
         raise OutlapError(f"{where} is {found!r:.60}; must be a Driver, a function, or the name of one")
-    return found if hasattr(found, "act") else FunctionDriver.of(found)  # type: ignore[arg-type]
+    return FunctionDriver.of(found)

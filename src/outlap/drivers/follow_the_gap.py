@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from outlap.drivers.driver import Driver
 from outlap.drivers.vehicle_actions import speed_action, steer_action
 from outlap.errors import OutlapError
 
@@ -14,7 +15,7 @@ LEAST_BEAMS = 9
 
 
 @dataclass(frozen=True)
-class FollowTheGap:
+class FollowTheGap(Driver):
     """Heads for the middle of the deepest gap that the car fits through (Sezer & Gokasan, 2012).
 
     Every return blocks the directions in which the car would touch it; what is left free in each direction is that
@@ -30,10 +31,6 @@ class FollowTheGap:
     cornering: float = 5.0  # [m/s²] counted on
     name: str = "follow-the-gap"
     observation_terms: tuple[str, ...] = ("scan", "action_span")
-    scale_observations: bool = False
-
-    def begin(self, cars: np.ndarray) -> None:
-        """See `Driver.begin`; it remembers nothing."""
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See `Driver.act`."""

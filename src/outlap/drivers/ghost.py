@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from outlap.drivers.driver import Driver
 from outlap.drivers.vehicle_actions import WHEELBASE, speed_action
 from outlap.errors import OutlapError, brief
 from outlap.files import atomic_write
@@ -33,7 +34,7 @@ class _Path(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Ghost:
+class Ghost(Driver):
     """Drives a recorded lap again, and again: its path, at its yaw and its speed in every place.
 
     It steers the curvature of the path, corrected by offset and yaw, so back to the path wherever it is put, and gives
@@ -43,7 +44,6 @@ class Ghost:
     lap: np.ndarray  # float64 (n, 5), see COLUMNS; the car's middle, in the order driven, once around
     name: str = "ghost"
     observation_terms: tuple[str, ...] = ("pose", "vel", "action_span")
-    scale_observations: bool = False
 
     def __post_init__(self) -> None:
         if self.lap.ndim != 2 or self.lap.shape[1] != len(COLUMNS) or len(self.lap) < SHORTEST:
@@ -56,9 +56,6 @@ class Ghost:
             raise OutlapError(f"{self.name}: {COLUMNS[column]} of point {row} is {self.lap[row, column]}")
         if not np.ptp(self.lap[:, 1:3], axis=0).any():
             raise OutlapError(f"{self.name}: all points of the lap are in one place")
-
-    def begin(self, cars: np.ndarray) -> None:
-        """See `Driver.begin`; it remembers nothing."""
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See `Driver.act`."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from outlap.drivers.driver import Driver, DriverStack
 from outlap.errors import OutlapError, brief
 from outlap.files import atomic_write, to_json
 
@@ -25,40 +26,37 @@ ROWS = 16
 MOST_WEIGHTS = 1 << 24  # of a file that is loaded: 64 MB
 
 
-@dataclass(frozen=True, eq=False)
-class MLPDriver:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MLPDriver(Driver):
     """Drives with a perceptron over observation terms, side by side in the order of their names."""
 
     name: str
     sizes: Mapping[str, int]  # of each term that it sees
     scale_observations: bool
-    speeds: tuple[float, float]  # [m/s] that its actions -1 and 1 command
+    speeds: tuple[float, float]  # pyright: ignore[reportIncompatibleVariableOverride]  # always known
     activation: str  # between layers; the last is clipped to [-1, 1]
     weights: tuple[np.ndarray, ...]  # float32 (inputs, outputs) of each layer
     biases: tuple[np.ndarray, ...]  # float32 (outputs,)
 
-    @property
-    def observation_terms(self) -> tuple[str, ...]:
-        """See `Driver`."""
-        return tuple(sorted(self.sizes))
+    observation_terms: tuple[str, ...] = field(init=False)
+    beams: int | None = field(init=False)
+    architecture: Hashable = field(init=False)
 
-    @property
-    def beams(self) -> int | None:
-        """Of the scan that it was trained on; None for one that does not look."""
-        return self.sizes.get("scan")
-
-    @property
-    def architecture(self) -> tuple[Any, ...]:
-        """Equal for drivers that can be asked together."""
+    def __post_init__(self) -> None:
         shapes = tuple(weight.shape for weight in self.weights)
-        return tuple(sorted(self.sizes.items())), self.scale_observations, self.activation, shapes
-
-    def begin(self, cars: np.ndarray) -> None:
-        """See `Driver.begin`; it remembers nothing."""
+        architecture = tuple(sorted(self.sizes.items())), self.scale_observations, self.activation, shapes
+        object.__setattr__(self, "observation_terms", tuple(sorted(self.sizes)))
+        object.__setattr__(self, "beams", self.sizes.get("scan"))
+        object.__setattr__(self, "architecture", architecture)
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See `Driver.act`."""
-        return DriverStack([self]).act(np.zeros(len(observation[self.observation_terms[0]]), np.int64), observation)
+        return MLPStack([self]).act(np.zeros(len(observation[self.observation_terms[0]]), np.int64), observation)
+
+    @classmethod
+    def stack(cls, drivers: Sequence[MLPDriver]) -> MLPStack:
+        """See `Driver.stack`."""
+        return MLPStack(drivers)
 
     @classmethod
     def from_ppo(cls, model: PPO, name: str, scale_observations: bool, speeds: tuple[float, float]) -> MLPDriver:
@@ -74,10 +72,14 @@ class MLPDriver:
             raise OutlapError(f"{name}: has layers {sorted(kind.__name__ for kind in between)}; must be Tanh or ReLU")
         sizes = {term: int(box.shape[0]) for term, box in model.observation_space.spaces.items()}  # type: ignore[attr-defined]
         return cls(
-            name, sizes, scale_observations, speeds, names[between.pop()],
-            tuple(layer.weight.detach().cpu().numpy().T.copy() for layer in linear),
-            tuple(layer.bias.detach().cpu().numpy().copy() for layer in linear),
-        )  # fmt: skip
+            name=name,
+            sizes=sizes,
+            scale_observations=scale_observations,
+            speeds=speeds,
+            activation=names[between.pop()],
+            weights=tuple(layer.weight.detach().cpu().numpy().T.copy() for layer in linear),
+            biases=tuple(layer.bias.detach().cpu().numpy().copy() for layer in linear),
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write PATH.safetensors with the weights and PATH.json with all else."""
@@ -115,13 +117,13 @@ class MLPDriver:
             tensors = load(content)
             layers = range(int(facts["layers"]))
             driver = cls(
-                str(facts["name"]),
-                {str(term): int(size) for term, size in facts["sizes"].items()},
-                bool(facts["scale_observations"]),
-                (float(facts["speeds"][0]), float(facts["speeds"][1])),
-                str(facts["activation"]),
-                tuple(tensors[f"weight_{i}"].astype(np.float32) for i in layers),
-                tuple(tensors[f"bias_{i}"].astype(np.float32) for i in layers),
+                name=str(facts["name"]),
+                sizes={str(term): int(size) for term, size in facts["sizes"].items()},
+                scale_observations=bool(facts["scale_observations"]),
+                speeds=(float(facts["speeds"][0]), float(facts["speeds"][1])),
+                activation=str(facts["activation"]),
+                weights=tuple(tensors[f"weight_{i}"].astype(np.float32) for i in layers),
+                biases=tuple(tensors[f"bias_{i}"].astype(np.float32) for i in layers),
             )
         except (OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, SafetensorError) as error:
             raise OutlapError(f"{path}: cannot be read as a driver: {brief(error)}") from None
@@ -146,7 +148,7 @@ class MLPDriver:
             raise OutlapError(f"{path}: gives {width} numbers; must be 2, steer and speed")
 
 
-class DriverStack:
+class MLPStack(DriverStack):
     """Perceptrons of one architecture, asked as one batch of matrix products."""
 
     def __init__(self, drivers: Sequence[MLPDriver]) -> None:
@@ -155,8 +157,6 @@ class DriverStack:
         for driver in drivers:
             if driver.architecture != first.architecture:
                 raise OutlapError(f"{driver.name}: has another architecture than {first.name}; ask them one by one")
-        self.observation_terms, self.scale_observations = first.observation_terms, first.scale_observations
-        self.beams = first.beams
         self._drivers = drivers
         self._activation = ACTIVATIONS[first.activation]
         depth = range(len(first.weights))
@@ -164,7 +164,7 @@ class DriverStack:
         self._biases = [np.stack([driver.biases[i] for driver in drivers])[:, None] for i in depth]
 
     def act(self, which: np.ndarray, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Actions (n, 2) of cars that are driven by the drivers of these numbers, int (n,).
+        """See `DriverStack.act`.
 
         Raises OutlapError for an observation of another shape than the drivers were trained on.
         """
@@ -174,7 +174,7 @@ class DriverStack:
                 raise OutlapError(
                     f"{self._drivers[0].name}: observation {term!r} has shape {found}; must be {(len(which), size)}"
                 )
-        seen = np.concatenate([observation[term] for term in self.observation_terms], axis=1)
+        seen = np.concatenate([observation[term] for term in self._drivers[0].observation_terms], axis=1)
         counts = np.bincount(which, minlength=len(self._drivers))
         order = np.argsort(which, kind="stable")
         place = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)

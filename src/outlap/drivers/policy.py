@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
+from outlap.config import Config
+from outlap.drivers.driver import Driver
 from outlap.errors import OutlapError, brief
 
 if TYPE_CHECKING:
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 BATCH = 64
 
 
-class PolicyDriver:
+class PolicyDriver(Driver):
     """Drives with the policy of a Stable-Baselines3 model, by default without its exploration noise.
 
     Actions do not depend on how many cars are asked about together, unless the policy is stochastic.
@@ -35,7 +37,7 @@ class PolicyDriver:
         seed: int = 0,
         name: str = "policy",
         speeds: tuple[float, float] | None = None,
-        reward: Any = None,
+        reward: Config | None = None,
     ) -> None:
         """Wrap a model.
 
@@ -85,7 +87,7 @@ class PolicyDriver:
         seed: int = 0,
         name: str = "policy",
         speeds: tuple[float, float] | None = None,
-        reward: Any = None,
+        reward: Config | None = None,
     ) -> PolicyDriver:
         """A model of an algorithm, PPO's by default, from the file that Stable-Baselines3 wrote, on the CPU.
 
@@ -112,10 +114,7 @@ class PolicyDriver:
         )
 
     def check(self, space: gym.Space) -> None:
-        """Compare what the policy was trained to see with what it would be shown.
-
-        Raises OutlapError that names the first term that differs, and how.
-        """
+        """See `Driver.check`; the error names the first term that differs from the training's, and how."""
         offered = space.spaces if isinstance(space, gym.spaces.Dict) else {}
         for term, trained in self._space.spaces.items():
             shown = offered.get(term)
@@ -161,7 +160,7 @@ class PolicyDriver:
         return actions
 
     def context(self) -> np.ndarray | None:
-        """What a policy with a context made of the steps before its last actions: (n, hidden); None without one."""
+        """See `Driver.context`."""
         policy: Any = self._policy
         if not getattr(policy, "uses_context", False) or not self._memories:
             return None

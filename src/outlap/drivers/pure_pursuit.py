@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from outlap.drivers.driver import Driver
 from outlap.drivers.vehicle_actions import WHEELBASE, speed_action, steer_action
 
 
 @dataclass(frozen=True)
-class PurePursuit:
+class PurePursuit(Driver):
     """Drives the arc through a point of the racing line ahead, at the line's speed (Coulter, 1992).
 
     The point is farther ahead the faster the car is, and the farther it is from the line. At the limit of grip a car
@@ -30,10 +31,6 @@ class PurePursuit:
     preview_time: float = 0.1  # [s] ahead from where the speed is taken: what the car takes to follow a command
     name: str = "pure-pursuit"
     observation_terms: tuple[str, ...] = ("line_ahead", "vel", "action_span")
-    scale_observations: bool = False
-
-    def begin(self, cars: np.ndarray) -> None:
-        """See `Driver.begin`; it remembers nothing."""
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """See `Driver.act`."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
 from outlap.config import Number, bounds
-from outlap.drivers.driver import Driver
-from outlap.drivers.mlp import DriverStack, MLPDriver
+from outlap.drivers.driver import Driver, DriverStack
 from outlap.envs.actions import driver_actions
 from outlap.envs.observations import OBSERVATION_TERMS, observe
 from outlap.envs.race import Race
@@ -47,16 +45,15 @@ class Opponents:
         self._keys = np.zeros(worlds, np.uint64)
         self._step = np.zeros(worlds, np.uint64)
         self._begins = np.ones((worlds, cars - 1), bool)
-        spans = [getattr(driver, "speeds", None) or (0.0, np.nan) for driver in drivers]
+        spans = [driver.speeds or (0.0, np.nan) for driver in drivers]
         self._spans = np.array(spans, np.float32).reshape(-1, 2)
         self._names = np.array([driver.name for driver in drivers] or [""], dtype=object)
         self._groups = _groups(drivers)
         for driver in drivers:
-            beams = getattr(driver, "beams", None)
-            if beams is not None and beams > race.worlds.scan.shape[2]:
+            if driver.beams is not None and driver.beams > race.worlds.scan.shape[2]:
                 raise OutlapError(
-                    f"driver {driver.name}: looks with {beams} beams, and the cars have {race.worlds.scan.shape[2]}; "
-                    f"set beams to {beams} or more"
+                    f"driver {driver.name}: looks with {driver.beams} beams, and the cars have "
+                    f"{race.worlds.scan.shape[2]}; set beams to {driver.beams} or more"
                 )
             unknown = [term for term in driver.observation_terms if term not in OBSERVATION_TERMS]
             if unknown:
@@ -101,14 +98,14 @@ class Opponents:
         """
         worlds, cars = self.number.shape
         out = np.zeros((worlds, cars, 2), np.float32)
-        for numbers, driver in self._groups:
+        for numbers, driver, stack in self._groups:
             mine = np.isin(self.number, numbers)
             if not mine.any():
                 continue
             observation = self._observe(driver)
-            if isinstance(driver, DriverStack):
+            if stack is not None:
                 which = np.searchsorted(numbers, self.number[mine])
-                out[mine] = driver.act(which, {name: value[mine] for name, value in observation.items()})
+                out[mine] = stack.act(which, {name: value[mine] for name, value in observation.items()})
                 continue
             driver.begin(self._begins.ravel())
             flat = {name: value.reshape(worlds * cars, -1) for name, value in observation.items()}
@@ -119,7 +116,7 @@ class Opponents:
         self._step += np.uint64(1)
         return np.clip(out, -1.0, 1.0)
 
-    def _observe(self, driver: Driver | DriverStack) -> dict[str, np.ndarray]:
+    def _observe(self, driver: Driver) -> dict[str, np.ndarray]:
         """What a driver would be told in every car: (worlds, cars - 1, size) of its terms.
 
         A driver that looks with fewer beams than the cars have gets the nearest ones.
@@ -127,9 +124,8 @@ class Opponents:
         terms, scaled = driver.observation_terms, driver.scale_observations
         seen = [observe(self.race, car, terms, scaled) for car in range(1, self.number.shape[1] + 1)]
         observation = {name: np.stack([each[name] for each in seen], axis=1) for name in seen[0]}
-        beams = getattr(driver, "beams", None)
-        if "scan" in observation and beams is not None and beams != observation["scan"].shape[2]:
-            chosen = np.rint(np.linspace(0, observation["scan"].shape[2] - 1, beams)).astype(np.int64)
+        if "scan" in observation and driver.beams is not None and driver.beams != observation["scan"].shape[2]:
+            chosen = np.rint(np.linspace(0, observation["scan"].shape[2] - 1, driver.beams)).astype(np.int64)
             observation["scan"] = observation["scan"][..., chosen]
         return observation
 
@@ -140,12 +136,14 @@ class Opponents:
         return radius * np.cos(2.0 * np.pi * share[:, count:])
 
 
-def _groups(drivers: Sequence[Driver]) -> list[tuple[np.ndarray, Driver | DriverStack]]:
-    """Drivers that are asked together, with their numbers, ascending."""
-    alike: dict[Any, list[int]] = {}
+def _groups(drivers: Sequence[Driver]) -> list[tuple[np.ndarray, Driver, DriverStack | None]]:
+    """Return the drivers that act together: their numbers, ascending, the first of them, and their stack if any."""
+    alike: dict[Hashable, list[int]] = {}
     for number, driver in enumerate(drivers):
-        alike.setdefault(driver.architecture if isinstance(driver, MLPDriver) else number, []).append(number)
-    return [
-        (np.array(numbers), DriverStack([drivers[i] for i in numbers]) if isinstance(key, tuple) else drivers[key])  # type: ignore[misc]
-        for key, numbers in alike.items()
-    ]
+        alike.setdefault(number if driver.architecture is None else driver.architecture, []).append(number)
+    groups = []
+    for numbers in alike.values():
+        members = [drivers[number] for number in numbers]
+        first = members[0]
+        groups.append((np.array(numbers), first, None if first.architecture is None else first.stack(members)))
+    return groups

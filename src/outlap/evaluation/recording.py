@@ -229,7 +229,7 @@ class _Watcher:
         if before is None:
             self.note(EGO, "start", f"start on {info['track'][0]}")
             return
-        context = getattr(self.driver, "context", lambda: None)()
+        context = self.driver.context()
         if context is not None:  # of the decision that led here
             self.contexts.append(np.asarray(context[0], np.float32))
         self._compare(before, self.frames[-1])

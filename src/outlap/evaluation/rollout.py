@@ -19,7 +19,6 @@ from gymnasium.vector import AutoresetMode
 
 from outlap.drivers.driver import Driver
 from outlap.drivers.find import find_drivers
-from outlap.drivers.policy import PolicyDriver
 from outlap.envs.actions import driver_actions
 from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig, StartConfig
@@ -84,10 +83,11 @@ def standing_starts(
 def made_for(driver: Driver, env: RaceConfig) -> RaceConfig:
     """A task with the scanner and the car that a driver was trained with, as far as it says so."""
     changes: dict[str, Any] = {}
-    if (beams := getattr(driver, "beams", None)) is not None:
-        changes["beams"] = beams
-    if (speeds := getattr(driver, "speeds", None)) is not None:
-        changes |= {"vehicle": env.vehicle.model_copy(update={"v_max": speeds[1]}), "speed_range": speeds}
+    if driver.beams is not None:
+        changes["beams"] = driver.beams
+    if driver.speeds is not None:
+        vehicle = env.vehicle.model_copy(update={"v_max": driver.speeds[1]})
+        changes |= {"vehicle": vehicle, "speed_range": driver.speeds}
     return env.model_copy(update=changes)
 
 
@@ -186,8 +186,7 @@ def _race(
     settings = episode_settings(driver, config, track)
     env = RaceVectorEnv(worlds, **settings, autoreset_mode=AutoresetMode.DISABLED)
     score = _Score(config.reward, settings["reward"], worlds)
-    if isinstance(driver, PolicyDriver):
-        driver.check(env.single_observation_space)
+    driver.check(env.single_observation_space)
     drawn = drawn_parameters(config)
     opponents = range(1, config.num_cars if isinstance(config.opponent_speed, tuple) else 1)
     length = track.centerline.length
@@ -265,7 +264,8 @@ def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[s
     settings["observation"] = driver.observation_terms
     settings["scale_observations"] = driver.scale_observations
     # At the end of every curriculum nothing is left of it: no lines need to be planned for a reference speed.
-    shown = getattr(driver, "reward", None) or config.reward
+    shown = driver.reward or config.reward
+    assert isinstance(shown, RewardConfig)
     settings["reward"] = _without_reference(shown)
     others: list[Driver] = []
     if config.num_cars > 1:
@@ -283,8 +283,7 @@ def single_race(driver: Driver, config: RaceConfig, track: Track) -> RaceVectorE
     """
     settings = {**episode_settings(driver, config, track), "beams": config.beams}
     env = RaceVectorEnv(1, **settings, autoreset_mode=AutoresetMode.DISABLED)
-    if isinstance(driver, PolicyDriver):
-        driver.check(env.single_observation_space)
+    driver.check(env.single_observation_space)
     return env
 
 
