@@ -32,7 +32,7 @@ class MLPDriver(Driver):
 
     name: str
     sizes: Mapping[str, int]  # of each term that it sees
-    scale_observations: bool
+    scale_observations: bool = False
     speeds: tuple[float, float]  # pyright: ignore[reportIncompatibleVariableOverride]  # always known
     activation: str  # between layers; the last is clipped to [-1, 1]
     weights: tuple[np.ndarray, ...]  # float32 (inputs, outputs) of each layer
