@@ -14,6 +14,7 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,8 +100,6 @@ def describe(run: Run, space: gym.spaces.Dict) -> dict[str, Any]:
 
     Raises OutlapError for observation terms that need a map or other cars' places, and for rewards that do.
     """
-    from outlap import __version__
-
     env = run.config.env
     terms = list(space.spaces)
     for name in terms:
@@ -120,7 +119,7 @@ def describe(run: Run, space: gym.spaces.Dict) -> dict[str, Any]:
     slowest, fastest = env.speed_range or (bounds(vehicle.v_min)[0], None)
     return {
         "format": FORMAT,
-        "outlap": __version__,
+        "outlap": version("outlap"),
         "run": run.folder.resolve().name,
         "algorithm": run.config.algorithm,
         "terms": terms,
