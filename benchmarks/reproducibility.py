@@ -134,10 +134,10 @@ def adaptation(folder: Path) -> str:
 
 def _rows(driver, folder: Path) -> str:
     from outlap.evaluation.rollout import evaluate, standing_starts
-    from outlap.track import Track
+    from outlap.track import load_track
     from outlap.training.run import load_run
 
-    track = Track.load("Cinderhill")
+    track = load_track("Cinderhill")
     task = standing_starts(load_run(folder / "given" / "ppo").config.env, [track], laps=0, time_limit=15.0)
     return digest(evaluate(driver, task, [track], episodes=16, seed=1).to_csv())
 

@@ -27,9 +27,8 @@ from outlap.experiments.engine import ONE_THREAD
 from outlap.files import atomic_write, to_json
 from outlap.processes import process_environment
 from outlap.provenance import provenance
-from outlap.track.catalog import list_tracks
+from outlap.track.catalog import list_tracks, load_track
 from outlap.track.generate import BUILTIN_TRAIN
-from outlap.track.track import Track
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.recurrent_ppo import RecurrentPPOConfig
@@ -120,7 +119,7 @@ def until(config: TrainingConfig, seconds: float, sample: Callable[[int, float],
         if race:
             from outlap.training.run import load_run
 
-            track = Track.load(config.env.tracks[0])
+            track = load_track(config.env.tracks[0])
             evaluate(load_run(folder).driver(), standing_starts(config.env, [track], 0, 5.0), [track], 20, seed=0)
 
 

@@ -21,7 +21,7 @@ from outlap.mql.buffers import HistoryBuffer
 from outlap.planning.friction import FrictionMap
 from outlap.track.archive import extract
 from outlap.track.generate import generate_track
-from outlap.track.map_io import read_raceline_csv, read_track, read_tum_centerline, write_raceline_csv
+from outlap.track.map_io import read_raceline_csv, read_track, read_tum_centerline, write_raceline_csv, write_track
 from outlap.track.raceline import Raceline
 from outlap.training.ppo import PPOConfig
 from recordings import circling
@@ -42,7 +42,7 @@ def replay_file(folder: Path) -> Path:
 
 def track_file(ending: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        ring(radius=4.0, resolution=0.1).save(folder)
+        write_track(ring(radius=4.0, resolution=0.1), folder)
         return next(folder.glob(f"*{ending}"))
 
     return make
@@ -78,7 +78,7 @@ def raceline_file(folder: Path) -> Path:
 
 
 def archive_file(folder: Path) -> Path:
-    generate_track(1, length=40.0, resolution=0.2).save(folder / "maps")
+    write_track(generate_track(1, length=40.0, resolution=0.2), folder / "maps")
     path = folder / "maps.tar.xz"
     with tarfile.open(path, "w:xz") as archive:
         archive.add(folder / "maps", "maps")

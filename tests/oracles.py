@@ -11,6 +11,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from outlap.track.track import Track
 
 Polygon = list[tuple[float, float]]  # corners, anticlockwise
 
@@ -194,3 +197,13 @@ def splitmix64(seed: int, count: int) -> list[int]:
         z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
         numbers.append(z ^ (z >> 31))
     return numbers
+
+
+# Grids
+
+
+def grid_to_world(track: Track, col: ArrayLike, row: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """(column, row) as floats → map frame [m]; a pixel's centre is at its index + 0.5."""
+    u, v = np.asarray(col, np.float64) * track.resolution, np.asarray(row, np.float64) * track.resolution
+    x, y, yaw = track.origin
+    return x + math.cos(yaw) * u - math.sin(yaw) * v, y + math.sin(yaw) * u + math.cos(yaw) * v

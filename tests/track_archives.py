@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from outlap.track import Centerline, Track
+from outlap.track.map_io import write_track
 from outlap.track.walls import draw_walls
 
 RADIUS = 4.0  # [m]
@@ -31,7 +32,7 @@ def circle_track(name: str = "Circle", radius: float = RADIUS) -> Track:
 
 def track_members(folder: Path, name: str = "Circle", radius: float = RADIUS) -> dict[str, bytes]:
     """The files of a circle's map folder by their names in an archive; `folder` is used to make them."""
-    circle_track(name, radius).save(folder / name)
+    write_track(circle_track(name, radius), folder / name)
     return {f"{name}/{path.name}": path.read_bytes() for path in sorted((folder / name).iterdir())}
 
 

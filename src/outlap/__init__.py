@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from outlap.errors import OutlapError
     from outlap.simulator.simulator import Simulator
+    from outlap.track.catalog import load_track
     from outlap.track.track import Track
 
-__all__ = ["OutlapError", "Simulator", "Track"]
+__all__ = ["OutlapError", "Simulator", "Track", "load_track"]
 __version__ = version("outlap")
 
 try:
@@ -28,6 +29,7 @@ else:
 _HOMES = {
     "OutlapError": "outlap.errors",
     "Simulator": "outlap.simulator.simulator",
+    "load_track": "outlap.track.catalog",
     "Track": "outlap.track.track",
 }
 

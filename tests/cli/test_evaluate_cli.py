@@ -15,6 +15,7 @@ from outlap.config import save_config
 from outlap.envs.race_config import RaceConfig
 from outlap.evaluation.metrics import summarise
 from outlap.simulator.vehicle import VehicleParams
+from outlap.track.map_io import write_track
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import create_run
 from synthetic_tracks import ring
@@ -39,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("evaluate")
     for radius in (5.0, 4.0):
         track = ring(radius=radius)
-        track.save(folder / "maps" / track.name)
+        write_track(track, folder / "maps" / track.name)
     run = create_run(folder / "run", PPOConfig(env=ENV, held_out_tracks=("ring4",), net_arch=(16, 16)))
     untrained_ppo(ENV, ring(radius=5.0)).save(run.folder / "policy.zip")
     return folder

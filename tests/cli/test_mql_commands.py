@@ -15,6 +15,7 @@ from outlap.evaluation.metrics import summarise_methods
 from outlap.evaluation.recording import Recording
 from outlap.evaluation.rollout import evaluate
 from outlap.mql.adaptation import adapt
+from outlap.track.map_io import write_track
 from synthetic_tracks import ring
 
 SMALL = [
@@ -30,7 +31,7 @@ SHORT = [
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run of a current folder from which two rings have names."""
     for radius in (5.0, 6.0):
-        ring(radius).save(tmp_path / "maps" / f"ring{radius:.0f}")
+        write_track(ring(radius), tmp_path / "maps" / f"ring{radius:.0f}")
     monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
     monkeypatch.chdir(tmp_path)
     assert main(["train", "mql", *SMALL, "--out", "run", "--quiet"]) == 0

@@ -18,6 +18,7 @@ from outlap.drivers.ghost import Ghost
 from outlap.drivers.population import read_manifest
 from outlap.experiments.engine import Engine
 from outlap.experiments.population import OpponentUnit
+from outlap.track.map_io import write_track
 from outlap.training.population import Opponent
 from small_populations import driver, population, ring_driver, save_population
 from synthetic_tracks import ring
@@ -28,7 +29,7 @@ RADIUS = 5.0  # [m]
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A current folder of its own, from which a ring has a name."""
-    ring(radius=RADIUS).save(tmp_path / "maps" / "ring5")
+    write_track(ring(radius=RADIUS), tmp_path / "maps" / "ring5")
     monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
@@ -212,7 +213,7 @@ def test_the_last_speed_is_not_passed(planned: list[OpponentUnit], call: Callabl
 def test_a_tracks_name_becomes_one_that_files_can_have(
     here: Path, planned: list[OpponentUnit], call: Callable[..., Any]
 ) -> None:
-    replace(ring(radius=RADIUS), name="Ring (new) #2").save(here / "Ring (new) #2")
+    write_track(replace(ring(radius=RADIUS), name="Ring (new) #2"), here / "Ring (new) #2")
     call("opponents", "train", "--track", "./Ring (new) #2", "--speeds", "2:2:1", "--held-out", "3", "--quiet")
     assert [each.name for each in planned] == ["Ring-new-2-2.0", "Ring-new-2-3.0"]
 

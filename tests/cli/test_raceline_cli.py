@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from outlap.cli.main import main
-from outlap.track.map_io import read_raceline_csv
+from outlap.track.map_io import read_raceline_csv, write_track
 from outlap.track.raceline import Raceline
 from synthetic_tracks import ring
 
@@ -23,7 +23,7 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return ring(5.0).save(tmp_path_factory.mktemp("tracks") / "ring5")
+    return write_track(ring(5.0), tmp_path_factory.mktemp("tracks") / "ring5")
 
 
 def plan(*words: str | Path, capfd: pytest.CaptureFixture[str]) -> dict:
@@ -69,7 +69,7 @@ def test_it_is_compared_with_the_raceline_that_the_track_has(tmp_path, capfd):
     angle = np.linspace(0.0, 2.0 * np.pi, 500, endpoint=False)
     ones = np.ones(500)
     theirs = Raceline(5.0 * angle, 5.0 * np.cos(angle), 5.0 * np.sin(angle), angle, 0.2 * ones, 4.0 * ones, 0.0 * ones)
-    folder = replace(track, raceline=theirs).save(tmp_path / "ring5")
+    folder = write_track(replace(track, raceline=theirs), tmp_path / "ring5")
     data = plan(folder, "--vehicle", "track", "--out", tmp_path / "a.csv", capfd=capfd)
     assert data["own_lap_time_s"] == pytest.approx(2.0 * np.pi * 5.0 / 4.0, rel=1e-3)
     assert data["limits"]["mu"] == pytest.approx(4.0**2 / 5.0 / 9.81)
@@ -78,7 +78,7 @@ def test_it_is_compared_with_the_raceline_that_the_track_has(tmp_path, capfd):
 
 
 def test_a_maps_own_raceline_is_not_replaced_unasked(tmp_path, monkeypatch, capfd):
-    folder = ring(5.0).save(tmp_path / "ring5")
+    folder = write_track(ring(5.0), tmp_path / "ring5")
     monkeypatch.chdir(folder)
     assert main(["raceline", ".", "--method", "centerline"]) == 2
     assert "belongs to the map in this folder; to replace it, give --out ring5_raceline.csv" in capfd.readouterr()[1]

@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from outlap.cli.main import main
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN
+from outlap.track.map_io import write_track
 from track_archives import LENGTH, ArchiveServer, circle_track, tar_xz, track_members
 
 
@@ -69,7 +70,7 @@ def tum_csv(path: Path, radius: float = 60.0) -> Path:
 
 
 def test_list_tells_names_sources_splits_and_lengths(run, tmp_path):
-    folder = circle_track().save(tmp_path / "mine" / "Circle")
+    folder = write_track(circle_track(), tmp_path / "mine" / "Circle")
     rows = {row["name"]: row for row in run("list")["tracks"]}
     assert rows.pop("Circle") == {
         "name": "Circle",
@@ -83,9 +84,9 @@ def test_list_tells_names_sources_splits_and_lengths(run, tmp_path):
 
 
 def test_list_shows_what_is_wrong_with_a_folder_and_goes_on(run, tmp_path, capfd):
-    broken = circle_track("Broken").save(tmp_path / "mine" / "Broken")
+    broken = write_track(circle_track("Broken"), tmp_path / "mine" / "Broken")
     (broken / "Broken_centerline.csv").write_text("0, 0, nan, 1\n" * 20)
-    circle_track().save(tmp_path / "mine" / "Circle")
+    write_track(circle_track(), tmp_path / "mine" / "Circle")
     rows = {row["name"]: row for row in run("list")["tracks"]}
     assert rows["Broken"]["length_m"] is None
     assert "Broken_centerline.csv" in rows["Broken"]["error"]
@@ -101,7 +102,7 @@ def test_list_shows_what_is_wrong_with_a_folder_and_goes_on(run, tmp_path, capfd
 
 
 def test_show_draws_a_picture_and_measures(cache, tmp_path, capfd):
-    circle_track().save(tmp_path / "mine" / "Circle")
+    write_track(circle_track(), tmp_path / "mine" / "Circle")
     assert main(["tracks", "show", "circle", "--json", "found.json"]) == 0
     with Image.open("Circle.png") as picture:
         assert min(picture.size) >= 300
@@ -118,7 +119,7 @@ def test_show_draws_a_picture_and_measures(cache, tmp_path, capfd):
 
 
 def test_show_says_what_is_wrong(fail, tmp_path):
-    circle_track().save(tmp_path / "mine" / "Circle")
+    write_track(circle_track(), tmp_path / "mine" / "Circle")
     assert "did you mean Circle?" in fail("show", "Cirkle")
     assert "must be a file that ends in .png" in fail("show", "Circle", "--out", "picture.txt")
     assert "must be a file that ends in .png" in fail("show", "Circle", "--out", ".")
@@ -133,7 +134,7 @@ def test_generate_writes_a_track_of_what_was_asked_for(run, tmp_path):
         *("generate", "--seed", "3", "--length", "120", "--width", "1.8"),
         *("--min-radius", "2", "--clockwise", "--out", "tracks/loop"),
     )
-    track = Track.load("tracks/loop")
+    track = load_track("tracks/loop")
     assert track.name == made["name"] == "loop"
     assert made["path"] == "tracks/loop"
     assert track.centerline.length == pytest.approx(120, rel=1e-3)
@@ -145,7 +146,7 @@ def test_generate_writes_a_track_of_what_was_asked_for(run, tmp_path):
 
 def test_generate_in_both_directions_and_with_defaults(run):
     assert run("generate", "--seed", "5", "--length", "100", "--anticlockwise", "--name", "left")["clockwise"] is False
-    assert Track.load("./left").name == "left"
+    assert load_track("./left").name == "left"
     assert run("generate", "--seed", "5", "--length", "100")["path"] == "generated-5"
 
 
@@ -168,7 +169,7 @@ def test_import_of_a_tum_csv_is_found_by_its_name(run, cache):
     made = run("import", "Round.csv")
     assert made["path"] == str(cache / "Round")
     assert [row["source"] for row in run("list")["tracks"] if row["name"] == "Round"] == ["cache"]
-    track = Track.load("round")
+    track = load_track("round")
     assert track.centerline.length == pytest.approx(2 * math.pi * 6.0, rel=1e-4)  # 1:10
     assert [float(w) for w in track.centerline.widths(1.0)] == pytest.approx([0.8, 0.6])
 
@@ -176,7 +177,7 @@ def test_import_of_a_tum_csv_is_found_by_its_name(run, cache):
 def test_import_with_another_scale_width_and_name(run):
     tum_csv(Path("Round.csv"))
     run("import", "Round.csv", "--scale", "0.05", "--half-width", "1.1", "--name", "Round 20")
-    track = Track.load("Round 20")
+    track = load_track("Round 20")
     assert track.name == "Round 20"
     assert track.centerline.length == pytest.approx(2 * math.pi * 3.0, rel=1e-4)
     assert [float(w) for w in track.centerline.widths(1.0)] == pytest.approx([1.1, 1.1])
@@ -184,9 +185,9 @@ def test_import_with_another_scale_width_and_name(run):
 
 def test_import_of_a_map_folder_keeps_the_walls(run, tmp_path):
     original = circle_track("Circle")
-    original.save(tmp_path / "somewhere" / "Circle")
+    write_track(original, tmp_path / "somewhere" / "Circle")
     run("import", str(tmp_path / "somewhere" / "Circle"))
-    stored = Track.load("Circle")
+    stored = load_track("Circle")
     assert np.array_equal(stored.occupancy, original.occupancy)
     assert (stored.resolution, stored.origin) == (original.resolution, original.origin)
 
@@ -196,22 +197,22 @@ def test_import_replaces_only_with_force(run, fail, cache):
     run("import", "Round.csv")
     tum_csv(Path("Round.csv"), radius=80.0)
     assert "--force" in fail("import", "Round.csv")
-    assert Track.load("Round").centerline.length == pytest.approx(2 * math.pi * 6.0, rel=1e-4)
+    assert load_track("Round").centerline.length == pytest.approx(2 * math.pi * 6.0, rel=1e-4)
     run("import", "Round.csv", "--force")
-    assert Track.load("Round").centerline.length == pytest.approx(2 * math.pi * 8.0, rel=1e-4)
+    assert load_track("Round").centerline.length == pytest.approx(2 * math.pi * 8.0, rel=1e-4)
     assert [path.name for path in cache.iterdir() if path.name != ".lock"] == ["Round"]
 
 
 def test_import_to_a_folder_leaves_the_cache_alone(run, fail, cache):
     tum_csv(Path("Round.csv"))
     assert run("import", "Round.csv", "--out", "maps/Round")["path"] == "maps/Round"
-    assert Track.load("maps/Round").name == "Round"
+    assert load_track("maps/Round").name == "Round"
     assert not cache.exists()
     assert "must be an empty or a new folder" in fail("import", "Round.csv", "--out", "maps/Round")
 
 
 def test_import_tells_of_a_name_that_is_found_elsewhere_first(run, tmp_path, capfd):
-    circle_track("Round").save(tmp_path / "mine" / "Round")
+    write_track(circle_track("Round"), tmp_path / "mine" / "Round")
     tum_csv(Path("Round.csv"))
     assert main(["tracks", "import", "Round.csv"]) == 0
     assert f"{tmp_path / 'mine' / 'Round'} has this name too and is found first" in capfd.readouterr().out
@@ -225,7 +226,7 @@ def test_import_says_what_is_wrong(fail, cache, tmp_path):
     assert "scale" in fail("import", "Round.csv", "--scale", "0")
     for name in ("../evil", "/evil", "..", ""):
         assert "cannot be a file's name" in fail("import", "Round.csv", "--name", name)
-    circle_track().save(tmp_path / "somewhere")
+    write_track(circle_track(), tmp_path / "somewhere")
     assert "--scale and --half-width" in fail("import", str(tmp_path / "somewhere"), "--scale", "0.1")
     assert [path for path in cache.iterdir() if path.name != ".lock"] == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["somewhere", "user", "work"]
@@ -248,7 +249,7 @@ def test_download(run, cache, server, tmp_path, capfd):
     assert set(row) == {"name", "status", "path", "url", "sha256", "size_bytes"}
     assert main(["tracks", "download", "Monza", "--url", server.url_template]) == 0
     assert capfd.readouterr().out == f"Monza present: {cache / 'Monza'}\n"
-    assert Track.load("Monza").name == "Monza"
+    assert load_track("Monza").name == "Monza"
 
 
 def test_download_says_what_is_wrong(fail, server):

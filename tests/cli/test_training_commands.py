@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from outlap.cli.main import main
+from outlap.track.map_io import write_track
 from synthetic_tracks import ring
 
 SMALL = [
@@ -25,7 +26,7 @@ SMALL = [
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A current folder of its own, from which a ring has a name."""
-    ring(radius=5.0).save(tmp_path / "maps" / "ring5")
+    write_track(ring(radius=5.0), tmp_path / "maps" / "ring5")
     monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path / "maps"))
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -11,6 +11,7 @@ from PIL import Image
 
 from outlap.cli.main import main
 from outlap.evaluation.recording import Recording
+from outlap.track.map_io import write_track
 from synthetic_tracks import ring
 
 SHORT = ["--time-limit", "3", "--quiet"]
@@ -21,7 +22,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the maps of two tracks, and an evaluation with recordings on both."""
     folder = tmp_path_factory.mktemp("viewer")
     for radius in (5.0, 6.0):
-        ring(radius, half_width=1.5).save(folder / "maps" / f"ring{radius:.0f}")
+        write_track(ring(radius, half_width=1.5), folder / "maps" / f"ring{radius:.0f}")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OUTLAP_TRACKS", str(folder / "maps"))
         words = ["pure-pursuit", "--tracks", "ring5", "ring6", "--episodes", "3", "--laps", "0", *SHORT]

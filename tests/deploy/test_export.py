@@ -17,6 +17,7 @@ from outlap.deploy.export import compare, export_policy
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.errors import OutlapError
+from outlap.track.map_io import write_track
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.recurrent_ppo import RecurrentPPOConfig
@@ -33,7 +34,7 @@ META = {**ENV, "observation": (*TERMS, "previous_reward"), "scale_observations":
 
 @pytest.fixture(scope="module")
 def track(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(ring(radius=6.0, half_width=1.5).save(tmp_path_factory.mktemp("maps") / "ring6"))
+    return str(write_track(ring(radius=6.0, half_width=1.5), tmp_path_factory.mktemp("maps") / "ring6"))
 
 
 def run_of(config: type[TrainingConfig], folder: Path, track: str, env: dict[str, Any], **settings: Any) -> Run:

@@ -15,7 +15,7 @@ from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.rollout import evaluate, standing_starts
 from outlap.simulator.vehicle import VehicleParams
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.track.generate import BUILTIN_HELD_OUT
 
 SPAN = np.array([[0.4, 0.0, 8.0]], np.float32)  # full lock [rad], slowest, fastest [m/s]
@@ -114,7 +114,7 @@ def test_it_does_not_aim_through_a_gap_that_it_does_not_fit_through():
 
 @pytest.mark.parametrize("name", sorted(UNTRAINED))
 def test_they_lap_a_circuit(name):
-    track = Track.load(BUILTIN_HELD_OUT[-1])
+    track = load_track(BUILTIN_HELD_OUT[-1])
     task = RaceConfig(beams=108, control_interval=4, speed_range=(0.0, 6.0), vehicle=VehicleParams(v_max=6.0))
     (driver,) = find_drivers([name], task.field_of_view)
     rows = evaluate(driver, standing_starts(task, [track], laps=1), [track], episodes=5, seed=0)

@@ -16,7 +16,7 @@ from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.rollout import evaluate, standing_starts
 from outlap.simulator.vehicle import VehicleParams
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.track.generate import BUILTIN_HELD_OUT
 from synthetic_tracks import ring
 from untrained_policies import untrained_ppo
@@ -49,7 +49,7 @@ def space(**changes: Any):
 
 
 def test_centerline_follower_laps_a_builtin_track():
-    track = Track.load(BUILTIN_HELD_OUT[-1])
+    track = load_track(BUILTIN_HELD_OUT[-1])
     follower: Any = CenterlineFollower(speed_action=0.4)
     task = TASK.model_copy(update={"control_interval": 10})
     rows = evaluate(follower, standing_starts(task, [track], laps=1), [track], episodes=2, seed=0)

@@ -9,7 +9,7 @@ from outlap.drivers.population import SHIPPED, load_population, read_manifest
 from outlap.envs.race_config import RaceConfig
 from outlap.evaluation.rollout import evaluate, standing_starts
 from outlap.simulator.vehicle import VehicleParams
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.training.population import opponent_defaults, verify
 
 
@@ -25,13 +25,13 @@ def test_its_members_are_the_papers_speeds_and_all_verified() -> None:
 def test_its_slowest_and_its_fastest_lap_their_circuit_as_the_manifest_says(number: int) -> None:
     member = read_manifest(SHIPPED)[number]
     (driver,) = load_population(SHIPPED, None, member.name)
-    rows = verify(driver, opponent_defaults().env, Track.load(member.track), laps=1, starts=3, seed=5)
+    rows = verify(driver, opponent_defaults().env, load_track(member.track), laps=1, starts=3, seed=5)
     assert rows["outcome"].tolist() == ["finished"] * 3
     assert np.allclose(rows["lap_time_s"].to_numpy(), member.lap_time_s, rtol=0.03)
 
 
 def test_a_field_of_them_can_be_raced_against() -> None:
-    track = Track.load(read_manifest(SHIPPED)[0].track)
+    track = load_track(read_manifest(SHIPPED)[0].track)
     env = RaceConfig(
         beams=108, control_interval=4, num_cars=4, opponents=("population",), speed_range=(0.0, 8.0),
         vehicle=VehicleParams(v_max=8.0),

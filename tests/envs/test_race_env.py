@@ -20,6 +20,7 @@ from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
 from outlap.envs.racing_line import LINE_SPEED
 from outlap.errors import OutlapError
 from outlap.simulator.atlas import FIRST_ROW, ROWS
+from outlap.track.map_io import write_track
 
 NAME = "outlap/Race-v0"
 EVERYTHING = (
@@ -82,7 +83,7 @@ def test_make_vec_takes_the_same_keywords(ellipse):
 
 
 def test_make_takes_tracks_by_name_and_folder(ellipse, tmp_path, monkeypatch):
-    folder = ellipse.save(tmp_path / "ellipse")
+    folder = write_track(ellipse, tmp_path / "ellipse")
     monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path))
     for tracks in (["ellipse"], "ellipse", [str(folder)]):
         assert gym.make(NAME, tracks=tracks, beams=0).reset(seed=0)[1]["track"] == "ellipse"

@@ -10,12 +10,15 @@ from scipy import stats
 
 from outlap.config import bounds
 from outlap.envs.race_vector_env import RaceVectorEnv
-from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
+from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.errors import OutlapError
 from outlap.seeding import world_keys
 from outlap.simulator import vehicle as column
 from outlap.simulator.vehicle import KINEMATIC_SPEED, N_PARAMS, ActuatorParams, LidarParams, PacejkaTyre, VehicleParams
+from outlap.track import catalog
+from outlap.track.catalog import load_tracks
 from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN
+from outlap.track.map_io import write_track
 from outlap.track.track import Track
 
 PARTS = {"vehicle": VehicleParams, "tyre": PacejkaTyre, "actuators": ActuatorParams, "lidar": LidarParams}
@@ -226,7 +229,7 @@ def test_the_built_in_sets_do_not_overlap_and_the_default_is_for_training(monkey
         asked_for.append(name)
         return replace(ellipse, name=name)
 
-    monkeypatch.setattr(Track, "load", load)
+    monkeypatch.setattr(catalog, "load_track", load)
     env = RaceVectorEnv(1, beams=0)
     assert tuple(asked_for) == BUILTIN_TRAIN
     assert env.config.tracks == BUILTIN_TRAIN
@@ -253,7 +256,7 @@ def test_augmented_tracks_are_driven_the_other_way_round_and_mirrored(ellipse, f
 
 
 def test_tracks_are_names_folders_or_tracks(ellipse, tmp_path):
-    folder = ellipse.save(tmp_path / "ellipse")
+    folder = write_track(ellipse, tmp_path / "ellipse")
     for given in (ellipse, [ellipse], (ellipse,), str(folder), [str(folder)], folder, [folder]):
         env = RaceVectorEnv(1, tracks=given, beams=0)
         _, info = env.reset(seed=0)

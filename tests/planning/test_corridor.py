@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from oracles import grid_to_world
 from outlap.errors import OutlapError
 from outlap.planning.corridor import corridor, wall_margin
 from outlap.planning.limits import Limits
@@ -59,7 +60,7 @@ def test_a_track_that_is_too_narrow_says_where():
     walls = track.occupancy.copy()
     x, y = 6.0 * math.cos(1.0), 6.0 * math.sin(1.0)
     height, width = walls.shape
-    cx, cy = track.grid_to_world(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
+    cx, cy = grid_to_world(track, *np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
     walls |= (np.hypot(cx - x, cy - y) < 1.3) & (np.hypot(cx, cy) > 5.2)
     narrow = Track("narrow", walls, track.resolution, track.origin, track.centerline)
     with pytest.raises(OutlapError, match=r"track narrow: at s = \d\.\d m it is narrower than 0\.70 m"):

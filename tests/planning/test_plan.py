@@ -24,7 +24,7 @@ from outlap.planning.limits import Limits
 from outlap.planning.min_laps import min_laps
 from outlap.planning.plan import DEFAULT_MARGIN, METHODS, PlannedLine, plan_line
 from outlap.simulator.vehicle import VehicleParams
-from outlap.track import Track
+from outlap.track import Track, load_track
 from outlap.track.centerline import Centerline
 from outlap.track.generate import generate_track
 from outlap.track.map_io import read_raceline_csv, write_raceline_csv
@@ -264,7 +264,7 @@ def test_pure_pursuit_drives_the_planned_lap(circuit):
 
 @pytest.mark.parametrize("name", ["levine", "IMS"])
 def test_real_circuits_are_lapped_no_slower_than_their_own_racelines(real_tracks: FilePath, name):
-    track = Track.load(real_tracks / name)
+    track = load_track(real_tracks / name)
     theirs = track.raceline
     assert theirs is not None
     line = plan_line(track, CAR.implied_by(theirs), margin=0.05)
@@ -273,7 +273,7 @@ def test_real_circuits_are_lapped_no_slower_than_their_own_racelines(real_tracks
 
 
 def test_pure_pursuit_drives_the_planned_lap_of_a_real_circuit(real_tracks: FilePath):
-    track = Track.load(real_tracks / "IMS")
+    track = load_track(real_tracks / "IMS")
     task = RaceConfig(vehicle=VehicleParams(v_max=8.0), racing_line="min-time", beams=0)
     rows = evaluate(PurePursuit(), standing_starts(task, [track], laps=1), [track], episodes=4, seed=0)
     assert rows["outcome"].tolist() == ["finished"] * 4

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from oracles import overlap_area, overlaps_wall, rectangle_corners
+from oracles import grid_to_world, overlap_area, overlaps_wall, rectangle_corners
 from outlap.simulator.atlas import build_atlas
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, rectangles_overlap, touches_wall
 from outlap.simulator.simulator import MODELS, Simulator
@@ -42,7 +42,7 @@ def test_contact_with_walls_is_that_of_clipped_polygons(seed):
     atlas = build_atlas([track])
     found = []
     for _ in range(250):
-        x, y = track.grid_to_world(rng.uniform(-1.0, 51.0), rng.uniform(-1.0, 41.0))
+        x, y = grid_to_world(track, rng.uniform(-1.0, 51.0), rng.uniform(-1.0, 41.0))
         yaw, length, width = rng.uniform(-7.0, 7.0), rng.uniform(0.1, 0.7), rng.uniform(0.05, 0.5)
         found.append(in_contact(track, x, y, yaw, length, width, atlas))
         body = float(x), float(y), yaw, length, width
@@ -58,7 +58,7 @@ def test_what_lies_outside_the_map_is_wall(yaw):
         (1.5, 0.101, False), (1.5, 0.099, True), (1.5, 1.899, False), (1.5, 1.901, True),
         (-0.1, 1.0, True), (-50.0, 1.0, True), (1.5, 1e7, True), (3.0, 2.0, True),
     ]:  # fmt: skip
-        x, y = track.grid_to_world(u / 0.05, v / 0.05)
+        x, y = grid_to_world(track, u / 0.05, v / 0.05)
         assert in_contact(track, x, y, yaw, 0.6, 0.2) == expected, (u, v)
 
 
@@ -66,7 +66,7 @@ def test_a_body_larger_than_any_clearance_that_is_stored_touches_a_far_wall():
     occupancy = np.zeros((201, 201), bool)
     occupancy[100, 171] = True  # its near edge is 70.5 cells from the middle
     track = hall(occupancy, 0.05)
-    x, y = track.grid_to_world(100.5, 100.5)
+    x, y = grid_to_world(track, 100.5, 100.5)
     assert in_contact(track, x, y, 0.0, 141.2 * 0.05, 0.2)
     assert not in_contact(track, x, y, 0.0, 140.8 * 0.05, 0.2)
     assert not in_contact(track, x, y, 0.5, 141.2 * 0.05, 0.2)
@@ -117,7 +117,7 @@ def slanted_wall(slant: float, yaw: float) -> tuple[Track, np.ndarray]:
     rows, cols = np.indices((cells, cells)) - cells // 2
     heights = [math.cos(slant) * (rows + up) - math.sin(slant) * (cols + right) for up in (0, 1) for right in (0, 1)]
     track = hall(np.min(heights, axis=0) >= 0.0, resolution, (-7.0, 4.0, yaw))
-    x, y = track.grid_to_world(cells / 2, cells / 2)
+    x, y = grid_to_world(track, cells / 2, cells / 2)
     return track, np.array([x, y, yaw + slant])
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from oracles import cast_rays_at_rectangle, cast_rays_at_walls
+from oracles import cast_rays_at_rectangle, cast_rays_at_walls, grid_to_world
 from outlap.simulator.atlas import build_atlas
 from outlap.simulator.lidar import beam_directions, cast_walls
 from outlap.simulator.vehicle import (
@@ -21,6 +21,7 @@ from outlap.simulator.vehicle import (
     NOISE_STD,
     WIDTH,
 )
+from outlap.track.catalog import load_track
 from outlap.track.track import Track
 from synthetic_tracks import CAR, hall, place, random_map, ring, yard
 
@@ -73,7 +74,7 @@ def test_ranges_are_exact_on_random_maps_from_random_poses(beams):
         origin = (*rng.uniform(-20.0, 20.0, 2), rng.uniform(-math.pi, math.pi))
         track = hall(random_map(rng, 45, 70, rng.choice([0.002, 0.02, 0.2])), resolution, origin)
         for _ in range(max(1, 128 // beams)):
-            x, y = map(float, track.grid_to_world(rng.uniform(0.0, 70.0), rng.uniform(0.0, 45.0)))
+            x, y = map(float, grid_to_world(track, rng.uniform(0.0, 70.0), rng.uniform(0.0, 45.0)))
             yaw, field_of_view = rng.uniform(-10.0, 10.0), rng.uniform(0.5, 2.0 * math.pi)
             max_range = rng.choice([0.3, 2.0, 30.0])
             ranges = cast(track, x, y, yaw, beams, field_of_view, max_range)
@@ -99,7 +100,7 @@ def test_the_edge_of_the_map_is_a_wall(yaw):
     rng = np.random.default_rng(1)
     track = hall(np.zeros((64, 63), bool), 0.05, (3.0, -2.0, yaw))  # 64: whole tiles, but for the ring
     for col, row in [(0.001, 0.001), (62.999, 63.999), *rng.uniform(0.0, 63.0, (6, 2))]:
-        x, y = map(float, track.grid_to_world(col, row))
+        x, y = map(float, grid_to_world(track, col, row))
         angles = yaw + beam_angles(540, 2.0 * math.pi)
         ranges = cast(track, x, y, yaw, 540, 2.0 * math.pi, 30.0)
         assert not grazes(track, ranges, x, y, angles, 30.0).any()
@@ -124,7 +125,7 @@ def test_rays_along_the_lines_of_the_grid_and_through_its_corners():
             # On a wall's own edge it is anyone's guess whether the scanner is inside.
             if track.occupancy[int(row) - 1 : int(row) + 1, int(col - 0.5) : int(col) + 1].any():
                 continue
-            x, y = map(float, track.grid_to_world(col, row))
+            x, y = map(float, grid_to_world(track, col, row))
             ranges = cast(track, x, y, yaw, 17, 2.0 * math.pi, 30.0)  # every 22.5 degrees
             grazes(track, ranges, x, y, yaw + beam_angles(17, 2.0 * math.pi), 30.0)
             tested += 1
@@ -138,7 +139,7 @@ def test_ranges_stay_exact_over_thousands_of_cells():
     rng = np.random.default_rng(7)
     for col in (20.0, 3490.0, 6980.0):
         for _ in range(8):
-            x, y = map(float, track.grid_to_world(col, rng.uniform(1.0, 59.0)))
+            x, y = map(float, grid_to_world(track, col, rng.uniform(1.0, 59.0)))
             angles = 0.2 + np.array([0.0, math.pi])[:, None] + beam_angles(33, 0.05)
             for side in angles:
                 ranges = cast(track, x, y, side[16], 33, 0.05, 400.0)
@@ -154,7 +155,7 @@ def test_every_track_of_an_atlas_is_cast_as_if_alone():
     ]
     together, directions = build_atlas(tracks), beam_directions(108, 6.0)
     for number, track in enumerate(tracks):
-        x, y = map(float, track.grid_to_world(8.3, 20.2))
+        x, y = map(float, grid_to_world(track, 8.3, 20.2))
         ranges = np.empty(108, np.float32)
         cast_walls(together, number, x, y, 0.4, *directions, 30.0, ranges)
         np.testing.assert_array_equal(ranges, cast(track, x, y, 0.4, 108, 6.0, 30.0))
@@ -168,7 +169,7 @@ def test_a_stair_of_cells_that_touch_at_corners_stops_all_but_grazing_rays():
     grazed = []
     for _ in range(20):
         row = rng.uniform(0.5, 20.0)
-        x, y = map(float, track.grid_to_world(row + rng.uniform(15.0, 38.0), row))
+        x, y = map(float, grid_to_world(track, row + rng.uniform(15.0, 38.0), row))
         angles = 2.356 + beam_angles(540, 1.5)
         grazed.append(grazes(track, cast(track, x, y, 2.356, 540, 1.5, 30.0), x, y, angles, 30.0))
     assert np.concatenate(grazed).mean() <= GRAZING_SHARE
@@ -176,7 +177,7 @@ def test_a_stair_of_cells_that_touch_at_corners_stops_all_but_grazing_rays():
 
 @pytest.mark.parametrize("name", ["IMS", "Spielberg"])
 def test_ranges_are_exact_on_real_circuits(real_tracks, name):
-    track = Track.load(real_tracks / name)
+    track = load_track(real_tracks / name)
     atlas = build_atlas([track])
     rng = np.random.default_rng(3)
     beams, max_range = 108, 30.0

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from outlap.errors import OutlapError
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.track.cache import cache_folder
 from outlap.track.catalog import find_entry, find_track, list_tracks, name_key, search_path
 from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN
+from outlap.track.map_io import write_track
 from track_archives import LENGTH, circle_track
 
 
@@ -28,7 +29,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path,
 
 
 def put(place: Path, name: str, radius: float = 4.0, folder: str | None = None) -> Path:
-    return circle_track(name, radius).save(place / (folder or name))
+    return write_track(circle_track(name, radius), place / (folder or name))
 
 
 def test_search_path(places):
@@ -78,9 +79,9 @@ def test_an_explicit_path_wins_over_a_name(places, tmp_path, monkeypatch):
     put(places[0], "Loop", radius=4.0)
     put(tmp_path / "here", "Loop", radius=6.0)
     monkeypatch.chdir(tmp_path / "here")
-    assert Track.load("./Loop").centerline.length == pytest.approx(LENGTH * 6 / 4, rel=1e-4)
+    assert load_track("./Loop").centerline.length == pytest.approx(LENGTH * 6 / 4, rel=1e-4)
     monkeypatch.chdir(tmp_path)
-    assert Track.load("Loop").centerline.length == pytest.approx(LENGTH, rel=1e-4)
+    assert load_track("Loop").centerline.length == pytest.approx(LENGTH, rel=1e-4)
 
 
 def test_an_exact_name_wins_over_a_similar_one(places):

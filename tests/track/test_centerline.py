@@ -181,11 +181,11 @@ def test_frenet_round_trip() -> None:
 
 @pytest.mark.parametrize("circuit", CIRCUITS)
 def test_frenet_round_trip_on_real_circuits(real_tracks: Path, circuit: str) -> None:
-    from outlap.track import Track
+    from outlap.track import load_track
 
     if not (real_tracks / circuit).is_dir():
         pytest.skip(f"needs real circuits: OUTLAP_TRACKS has no {circuit}")
-    check_round_trip(Track.load(real_tracks / circuit).centerline)
+    check_round_trip(load_track(real_tracks / circuit).centerline)
 
 
 def test_points_traced_on_pixels_make_a_line_that_a_car_can_follow() -> None:
@@ -293,10 +293,10 @@ def test_kernels_match_the_class_and_each_other() -> None:
 
 
 def test_kernels_match_the_class_on_real_circuits(real_tracks: Path) -> None:
-    from outlap.track import Track
+    from outlap.track import load_track
 
     for folder in sorted(path for path in real_tracks.iterdir() if path.is_dir())[:10]:
-        check_kernels(Track.load(folder).centerline, before=5, widest=0.8)
+        check_kernels(load_track(folder).centerline, before=5, widest=0.8)
 
 
 def test_frenet_project_walks_from_a_far_guess() -> None:

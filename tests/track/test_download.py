@@ -18,7 +18,7 @@ import pytest
 
 import outlap.track.download as download_module
 from outlap.errors import OutlapError
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.track.archive import ArchiveLimits
 from outlap.track.download import LOCK_FILE, DownloadedTrack, download_tracks
 from outlap.track.transfer import Patience, UnreachableError
@@ -70,7 +70,7 @@ def test_a_good_archive_is_found_by_its_name_and_its_digest_is_recorded(server, 
     server.answers["/Circle.tar.xz"] = archive
     (got,) = get(server, "Circle")
     assert (got.name, got.status, got.path) == ("Circle", "downloaded", cache / "Circle")
-    assert Track.load("Circle").centerline.length == pytest.approx(LENGTH, rel=1e-5)
+    assert load_track("Circle").centerline.length == pytest.approx(LENGTH, rel=1e-5)
     lock = json.loads((cache / LOCK_FILE).read_text())
     assert set(lock["Circle"]) == {"url", "sha256", "size_bytes", "date"}
     assert lock["Circle"]["sha256"] == hashlib.sha256(archive).hexdigest()
@@ -94,7 +94,7 @@ def test_official_names_in_any_spelling(server, cache, tmp_path):
     )
     (got,) = get(server, "mexico city", "Mexico City")
     assert got.name == "MexicoCity"
-    assert Track.load("México City").name == "MexicoCity"
+    assert load_track("México City").name == "MexicoCity"
 
 
 def test_an_archive_without_a_folder_and_with_hidden_files(server, cache, members):
@@ -102,7 +102,7 @@ def test_an_archive_without_a_folder_and_with_hidden_files(server, cache, member
     server.answers["/Circle.tar.xz"] = tar_xz(flat | {"./._Circle_map.yaml": b"\x00\x05"})
     get(server, "Circle")
     assert not list((cache / "Circle").glob(".*"))
-    assert Track.load("Circle").name == "Circle"
+    assert load_track("Circle").name == "Circle"
 
 
 def test_redirects_are_followed(server, cache, archive):
@@ -249,11 +249,11 @@ def test_a_changed_archive_needs_update_lock(server, cache, archive, tmp_path):
 
     (second,) = get(server, "Circle", update_lock=True)
     assert second.archive.sha256 == hashlib.sha256(changed).hexdigest()
-    assert Track.load("Circle").centerline.length == pytest.approx(LENGTH * 5 / 4, rel=1e-4)
+    assert load_track("Circle").centerline.length == pytest.approx(LENGTH * 5 / 4, rel=1e-4)
 
     server.answers["/Circle.tar.xz"] = archive  # and back, over a track that is there
     assert get(server, "Circle", update_lock=True)[0].archive.sha256 == first.archive.sha256
-    assert Track.load("Circle").centerline.length == pytest.approx(LENGTH, rel=1e-4)
+    assert load_track("Circle").centerline.length == pytest.approx(LENGTH, rel=1e-4)
     assert leftovers(cache) == []
 
 
@@ -366,12 +366,12 @@ def test_a_kill_in_the_middle_leaves_nothing_behind(server, cache, archive):
         process.wait()
     assert visible(cache) == []
     with pytest.raises(OutlapError, match="no track is called 'Circle'"):
-        Track.load("Circle")
+        load_track("Circle")
 
     server.answers["/Circle.tar.xz"] = archive
     assert get(server, "Circle")[0].status == "downloaded"
     assert leftovers(cache) == []
-    assert Track.load("Circle").name == "Circle"
+    assert load_track("Circle").name == "Circle"
 
 
 @pytest.mark.parametrize("moment", ["extract", "read_track", "_write_lock", "install"])

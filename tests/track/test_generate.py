@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from circuit_features import measure_features
 from outlap.errors import OutlapError
 from outlap.track import circuit, generate
 from outlap.track.centerline import Centerline
-from outlap.track.features import measure_features
 from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN, builtin_track, generate_track
 
 CASES = [

@@ -14,7 +14,7 @@ from outlap.errors import OutlapError
 from outlap.evaluation.rollout import evaluate
 from outlap.mql.buffers import HistoryBuffer
 from outlap.mql.mql import MQL
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.training.mql import MQLConfig
 from outlap.training.run import load_run
 from outlap.training.session import train
@@ -58,7 +58,7 @@ def test_an_evaluation_does_not_depend_on_how_many_race_at_once() -> None:
     rows = []
     for worlds in (3, 6):
         driver = PolicyDriver.load(run.policy_path, algorithm=MQL, scale_observations=True)
-        rows.append(evaluate(driver, ENV, [Track.load("ring5")], episodes=6, seed=1, num_worlds=worlds))
+        rows.append(evaluate(driver, ENV, [load_track("ring5")], episodes=6, seed=1, num_worlds=worlds))
     assert rows[0].equals(rows[1])
 
 

@@ -20,6 +20,7 @@ from outlap.experiments.engine import LocalEngine
 from outlap.experiments.population import OpponentUnit, enter_all
 from outlap.experiments.runner import run_units
 from outlap.simulator.vehicle import VehicleParams
+from outlap.track.map_io import write_track
 from outlap.training.population import SLOWEST, Opponent, enter, opponent_config, verify
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
@@ -49,7 +50,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A population, the training of whose first member was stopped halfway and gone on with."""
     folder = tmp_path_factory.mktemp("population")
     track = ring(radius=5.0)
-    map_folder = str(track.save(folder / "maps" / track.name))
+    map_folder = str(write_track(track, folder / "maps" / track.name))
     units = tuple(
         OpponentUnit(each.name, TINY, map_folder, each.max_speed_mps, each.split, laps=1, starts=2)
         for each in OPPONENTS

@@ -15,9 +15,9 @@ from stable_baselines3 import PPO
 from outlap.config import load_config
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.sb3_vec_env import SB3VecEnv
-from outlap.envs.tasks import load_tracks
 from outlap.errors import OutlapError
 from outlap.simulator.simulator import Simulator
+from outlap.track.catalog import load_tracks
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
 from outlap.training.session import Progress, train

@@ -21,7 +21,7 @@ from outlap.evaluation.rollout import evaluate
 from outlap.experiments.figures import read_learning
 from outlap.mql.adaptation import AdaptationSettings, adapt
 from outlap.mql.mql import MQL
-from outlap.track import Track
+from outlap.track import load_track
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.recurrent_ppo import RecurrentPPOConfig
@@ -138,7 +138,7 @@ def test_an_adaptation_and_an_evaluation_repeat_their_rows(threads):
         updates.append(repr(record.updates))
         weights.append(np.concatenate([value.numpy().ravel() for value in policy.state_dict().values()]))
         driver = PolicyDriver(meta, scale_observations=True)
-        rows.append(evaluate(driver, run.config.env, [Track.load("ring5")], episodes=8, seed=1))
+        rows.append(evaluate(driver, run.config.env, [load_track("ring5")], episodes=8, seed=1))
     assert updates[0] == updates[1]
     np.testing.assert_array_equal(*weights)
     assert rows[0].equals(rows[1])

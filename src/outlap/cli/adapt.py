@@ -131,7 +131,6 @@ class Adapt:
 
         from outlap.drivers.policy import PolicyDriver
         from outlap.envs.sb3_vec_env import SB3VecEnv
-        from outlap.envs.tasks import load_tracks
         from outlap.envs.terminations import CRASH
         from outlap.evaluation.metrics import summarise_methods
         from outlap.evaluation.results import UPDATES, Parts, save_results, write_rows
@@ -139,6 +138,7 @@ class Adapt:
         from outlap.mql.adaptation import AdaptationSettings, adapt
         from outlap.mql.propensity import CLIP_RULES
         from outlap.provenance import provenance
+        from outlap.track.catalog import load_tracks
         from outlap.training.mql import load_meta
         from outlap.training.run import load_run
 

@@ -82,10 +82,10 @@ class BenchmarkSimulator(LongCommand):
 def _measure(settings: BenchmarkSimulator, cars: int, beams: int) -> dict[str, Any]:
     import numpy as np
 
-    from outlap.envs.tasks import load_tracks
     from outlap.simulator.collision import FREE
     from outlap.simulator.simulator import Simulator, SimulatorConfig
     from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+    from outlap.track.catalog import load_tracks
     from outlap.track.generate import BUILTIN_TRAIN
 
     tracks = load_tracks(settings.tracks or BUILTIN_TRAIN)

@@ -68,9 +68,9 @@ def _race(settings: BenchmarkViewer) -> tuple[Driver, RaceConfig, Track]:
     from outlap.drivers.find import find_drivers
     from outlap.envs.race_config import RaceConfig
     from outlap.evaluation.rollout import standing_starts
-    from outlap.track import Track
+    from outlap.track import load_track
 
-    track = Track.load(settings.track)
+    track = load_track(settings.track)
     race = RaceConfig(
         num_cars=settings.cars, opponents=("follow-the-gap",), beams=settings.beams, control_interval=4,
         speed_range=(0.0, 6.0),

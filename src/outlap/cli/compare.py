@@ -53,11 +53,11 @@ class Compare(LongCommand):
     def run(self) -> CommandResult:
         import pandas as pd
 
-        from outlap.envs.tasks import load_tracks
         from outlap.evaluation.results import prepare_folder
         from outlap.evaluation.rollout import evaluate, made_for, standing_starts
         from outlap.experiments.comparison import Subject, group, write_comparison
         from outlap.provenance import provenance
+        from outlap.track.catalog import load_tracks
 
         check_least("--episodes", self.episodes, 1)
         check_least("--seed", self.seed, 0)

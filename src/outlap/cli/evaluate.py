@@ -70,8 +70,8 @@ class Evaluate(RaceFlags, LongCommand):
 
     def run(self) -> CommandResult:
         self._check_flags()
-        from outlap.envs.tasks import load_tracks
         from outlap.evaluation.rollout import standing_starts
+        from outlap.track.catalog import load_tracks
 
         if self.stochastic and not is_run(self.driver):
             raise OutlapError(f"--stochastic is for a trained run; {self.driver} draws nothing")

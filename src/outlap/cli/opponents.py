@@ -67,12 +67,12 @@ class TrainOpponents(WorkFlags):
 
     def run(self) -> CommandResult:
         from outlap.experiments.population import OpponentUnit, enter_all
-        from outlap.track import Track
+        from outlap.track import load_track
 
         check_least("--laps", self.laps, 1)
         check_least("--starts", self.starts, 1)
         self.check_flags()
-        track = Track.load(self.track)
+        track = load_track(self.track)
         folder = self.out or Path("populations") / track.name
         opponents = _opponents(track.name, _span(self.speeds), self.held_out)
         units = [
@@ -113,7 +113,7 @@ class RecordLap:
         from outlap.cli.races import find_subject, with_top_speed
         from outlap.drivers.ghost import Ghost
         from outlap.evaluation.recording import record_lap
-        from outlap.track import Track
+        from outlap.track import load_track
 
         if self.out.suffix != ".csv":
             raise OutlapError(f"--out is {self.out}; must end in .csv, by which a recorded lap is known")
@@ -121,7 +121,7 @@ class RecordLap:
             raise OutlapError(f"--v-max is {self.v_max}; must be > 0")
         driver, env, _ = find_subject(self.driver)
         env = with_top_speed(env, self.v_max)
-        lap = record_lap(driver, env, Track.load(self.track), self.seed)
+        lap = record_lap(driver, env, load_track(self.track), self.seed)
         try:
             path = Ghost(lap, self.out.stem).save(self.out)
         except OSError as error:
@@ -205,7 +205,7 @@ class VerifyOpponents:
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
-        from outlap.track import Track
+        from outlap.track import load_track
         from outlap.training.population import Opponent, enter, verify
 
         check_least("--laps", self.laps, 1)
@@ -216,7 +216,7 @@ class VerifyOpponents:
         with progress_bar("verifying", len(drivers), "opponents", self.quiet) as update:
             for driver in drivers:
                 member = members[driver.name]
-                track = Track.load(member.track)
+                track = load_track(member.track)
                 found = verify(driver, PPOConfig().env, track, self.laps, self.starts)
                 opponent = Opponent(member.name, member.max_speed_mps, member.split)
                 kept = enter(self.folder, opponent, found, member.track, self.laps, member.command)

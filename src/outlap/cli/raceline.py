@@ -58,14 +58,14 @@ class PlanRaceline(LongCommand):
     def run(self) -> CommandResult:
         from outlap.planning.friction import FrictionMap
         from outlap.planning.plan import DEFAULT_MARGIN, plan_line
-        from outlap.track import Track
+        from outlap.track import load_track
         from outlap.track.map_io import write_raceline_csv
 
         for flag in ("v_max", "mu", "a_max", "a_brake"):
             value = getattr(self, flag)
             if value is not None and not 0.0 < value < float("inf"):
                 raise OutlapError(f"--{flag.replace('_', '-')} is {value}; must be > 0")
-        track = Track.load(self.track)
+        track = load_track(self.track)
         limits = self._limits(track)
         friction = None if self.friction is None else FrictionMap.read(self.friction, track.centerline.length)
         if friction is not None and self.mu is not None:

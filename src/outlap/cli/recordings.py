@@ -87,7 +87,7 @@ class EpisodeFlags(RaceFlags):
         """
         from outlap.evaluation.recording import Recording, record_episode
         from outlap.evaluation.rollout import episode_seeds, standing_starts
-        from outlap.track import Track
+        from outlap.track import load_track
 
         self.check_races()
         check_positive("--time-limit", self.time_limit)
@@ -101,7 +101,7 @@ class EpisodeFlags(RaceFlags):
         if not drivers:
             self._check_unused()
         recorded = [recording for files in loaded.values() for recording in files.values()]
-        track = Track.load(self.track or _track_name(recorded, [found.task for found in drivers.values()]))
+        track = load_track(self.track or _track_name(recorded, [found.task for found in drivers.values()]))
         chosen = {name: _raced_on(track, name, files) for name, files in loaded.items()}
         # Drivers race the episode of the first recording, if there is one.
         seeds = [recording.info.seed for files in chosen.values() for recording in files]

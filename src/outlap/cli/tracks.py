@@ -53,9 +53,9 @@ class ShowTrack(Command):
     """The picture; NAME.png here by default. An older one is replaced."""
 
     def run(self) -> CommandResult:
-        from outlap.track import Track
+        from outlap.track import load_track
 
-        track = Track.load(self.track)
+        track = load_track(self.track)
         out = self.out or Path(f"{track.name}.png")
         if out.is_dir() or out.suffix.lower() not in (".png", ".pdf", ".svg"):
             raise OutlapError(f"--out is {out}; must be a file that ends in .png, .pdf or .svg")
@@ -235,8 +235,10 @@ def _require_empty(folder: Path) -> None:
 
 
 def _save(track: Track, folder: Path) -> Path:
+    from outlap.track import write_track
+
     try:
-        return track.save(folder)
+        return write_track(track, folder)
     except OSError as error:
         raise OutlapError(f"{folder}: cannot be written: {error.strerror}") from error
 

@@ -40,7 +40,7 @@ class WatchRaces(RaceFlags, Command):
 
     def run(self) -> CommandResult:
         from outlap.evaluation.rollout import standing_starts
-        from outlap.track import Track
+        from outlap.track import load_track
         from outlap.viewer.watch import Watch
 
         self.check_races()
@@ -48,7 +48,7 @@ class WatchRaces(RaceFlags, Command):
         check_positive("--time-limit", self.time_limit)
         check_least("--size", min(self.size), 64)
         found = self.subject(self.driver)
-        track = Track.load(self.track or held_out_tracks(found.task)[0])
+        track = load_track(self.track or held_out_tracks(found.task)[0])
         env = standing_starts(found.env, [track], self.laps, self.time_limit)
         log.info("preparing %s on %s; h in the window lists the keys", found.driver.name, track.name)
         watch = Watch(found.driver, env, track, self.seed, self.size)

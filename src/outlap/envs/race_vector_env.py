@@ -22,13 +22,14 @@ from outlap.envs.race_config import RaceConfig
 from outlap.envs.racing_line import ReferenceSpeeds, racing_lines
 from outlap.envs.rewards import REWARD_TERMS
 from outlap.envs.starts import draw_starts
-from outlap.envs.tasks import TaskSet, load_tracks, track_name
+from outlap.envs.tasks import TaskSet, track_name
 from outlap.envs.terminations import RUNNING, STALLED, outcomes
 from outlap.errors import OutlapError
 from outlap.seeding import world_keys
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL
 from outlap.simulator.simulator import Simulator
 from outlap.simulator.vehicle import parameter_bounds
+from outlap.track.catalog import load_tracks
 from outlap.track.track import Track
 
 START_ATTEMPTS = 20

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -89,17 +88,3 @@ def track_name(track: str | os.PathLike[str] | Track) -> str:
     if not isinstance(track, (str, os.PathLike, Track)):
         raise OutlapError(f"tracks: {track!r:.60} is not a track; give a name, a map folder or a Track")
     return track.name if isinstance(track, Track) else os.fspath(track)
-
-
-def load_tracks(names: Sequence[str | os.PathLike[str] | Track], augment: bool = False) -> tuple[Track, ...]:
-    """Tracks by name or path; one that is loaded already is taken as it is.
-
-    Args:
-        names: of the tracks.
-        augment: add each one driven the other way round, mirrored, and both.
-    """
-    tracks = tuple(name if isinstance(name, Track) else Track.load(name) for name in names)
-    if not augment:
-        return tracks
-    both_ways = [way for track in tracks for way in (track, track.reversed())]
-    return tuple(seen for track in both_ways for seen in (track, track.mirrored()))

@@ -24,12 +24,12 @@ from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_TERMS, RewardConfig
-from outlap.envs.tasks import load_tracks
 from outlap.envs.terminations import CRASH, TerminationConfig
 from outlap.errors import OutlapError
 from outlap.planning.limits import Limits
 from outlap.planning.min_laps import min_laps
 from outlap.simulator.vehicle import parameter_bounds, parameter_names
+from outlap.track.catalog import load_tracks
 from outlap.track.track import Track
 
 log = logging.getLogger(__name__)

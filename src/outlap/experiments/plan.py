@@ -18,8 +18,7 @@ from outlap.experiments.population import OpponentUnit, PopulationUnit
 from outlap.experiments.unit import Unit
 from outlap.experiments.units import POPULATION, ClippingUnit, RaceUnit, Task, TrainingUnit, adaptation_settings
 from outlap.files import atomic_write, to_json
-from outlap.track.catalog import find_entry
-from outlap.track.track import Track
+from outlap.track.catalog import find_entry, load_track
 from outlap.training.ppo import PPOConfig
 
 FIGURE_2, APPENDIX, ALL = "figure-2", "appendix", "all"
@@ -112,7 +111,7 @@ def remember_tracks(names: Iterable[str], work: Path) -> dict[str, str]:
     path = work / "tracks.json"
     known: dict[str, str] = json.loads(path.read_text()) if path.exists() else {}
     for name in names:
-        fingerprint = Track.load(name).fingerprint
+        fingerprint = load_track(name).fingerprint
         if known.setdefault(name, fingerprint) != fingerprint:
             raise OutlapError(f"{work}: was made with another track called {name}; give another --out, or remove it")
     atomic_write(path, to_json(known) + "\n")

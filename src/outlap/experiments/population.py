@@ -14,7 +14,7 @@ from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.unit import Report, Unit
 from outlap.files import replacing
-from outlap.track.track import Track
+from outlap.track.catalog import load_track
 from outlap.training.population import Opponent, enter, train_opponent, verify
 from outlap.training.ppo import PPOConfig
 
@@ -60,7 +60,7 @@ class OpponentUnit(Unit):
             self.opponent, self.settings, self.track, self.run_folder(work), lambda steps: report(0.95 * steps / total)
         )
         driver.save(folder / self.name)
-        track = Track.load(self.track)
+        track = load_track(self.track)
         write_rows(verify(driver, self.settings.env, track, self.laps, self.starts), folder / ROWS)
 
 

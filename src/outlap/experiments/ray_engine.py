@@ -347,10 +347,10 @@ def _now_and_then(seconds: float, act: Callable[[], None]) -> Callable[[], None]
 
 def _check_tracks(unit: Unit, fingerprints: Mapping[str, str]) -> None:
     """Raises OutlapError for a track that is another one here than where the work was planned."""
-    from outlap.track.track import Track
+    from outlap.track.catalog import load_track
 
     for name in unit.tracks:
-        if name in fingerprints and Track.load(name).fingerprint != fingerprints[name]:
+        if name in fingerprints and load_track(name).fingerprint != fingerprints[name]:
             raise OutlapError(
                 f"track {name}: is another one on machine {os.uname().nodename} than where the work began; "
                 "give all machines the same tracks"

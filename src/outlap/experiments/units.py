@@ -143,12 +143,12 @@ class RaceUnit(Unit):
 
     def do(self, work: Path, report: Report) -> None:
         from outlap.evaluation.rollout import EvaluationProgress, evaluate, standing_starts
-        from outlap.track.track import Track
+        from outlap.track.catalog import load_track
 
         meta = load_meta(self.training.run(work)) if self.adaptation is not None and self.training else None
         rows = []
         for number, task in enumerate(self.tasks):
-            track = Track.load(task.track)
+            track = load_track(task.track)
             env = resolve(changed(self.env, task.changes), self.population, work)
             env = env.model_copy(update={"reward": self.score})
             races = standing_starts(env, [track], laps=0, time_limit=self.time_limit)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -56,6 +57,42 @@ class TrackEntry:
         if not found:
             raise OutlapError(f"{self.path}: has no {self.name}_centerline.csv; a track needs its centreline")
         return map_io.read_centerline_csv(found[0]).length
+
+
+def load_track(path_or_name: str | os.PathLike[str]) -> Track:
+    """Load an F1TENTH map folder, a TUM centreline csv, or a track by name.
+
+    A folder or file that exists wins over a name.
+
+    Raises:
+        OutlapError: nothing is found, or what is found is not a valid track.
+    """
+    path = Path(path_or_name).expanduser()
+    text = os.fspath(path_or_name)
+    is_bare_name = isinstance(path_or_name, str) and not {"/", os.sep} & set(text) and text not in (".", "..")
+    if path.is_file() and path.suffix.lower() == ".csv":
+        return map_io.read_tum_centerline(path)
+    # A folder that merely shares a track's name is not that track.
+    if path.is_dir() and not (is_bare_name and not map_io.find_yaml_files(path)):
+        return map_io.read_track(path)
+    if is_bare_name and not path.is_file():
+        return find_track(text)
+    what = "is neither a map folder nor a centreline .csv" if path.is_file() else "does not exist"
+    raise OutlapError(f"{path}: {what}; give a map folder, a centreline .csv or a track's name")
+
+
+def load_tracks(tracks: Sequence[str | os.PathLike[str] | Track], augment: bool = False) -> tuple[Track, ...]:
+    """Load tracks by name or path; one that is loaded already is returned as it is.
+
+    Args:
+        tracks: names, paths or tracks.
+        augment: add each one driven the other way round, mirrored, and both.
+    """
+    loaded = tuple(each if isinstance(each, Track) else load_track(each) for each in tracks)
+    if not augment:
+        return loaded
+    both_ways = [way for track in loaded for way in (track, track.reversed())]
+    return tuple(seen for track in both_ways for seen in (track, track.mirrored()))
 
 
 def search_path() -> list[Path]:

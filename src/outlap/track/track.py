@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,36 +44,6 @@ class Track:
         occupancy.setflags(write=False)
         object.__setattr__(self, "occupancy", occupancy)
         object.__setattr__(self, "origin", tuple(map(float, self.origin)))
-
-    @classmethod
-    def load(cls, path_or_name: str | os.PathLike[str]) -> Track:
-        """Load an F1TENTH map folder, a TUM centreline csv, or a track by name.
-
-        A folder or file that exists wins over a name. Raises OutlapError when nothing is found or
-        what is found is not a valid track.
-        """
-        from outlap.track import map_io  # imported late: map_io builds Tracks
-
-        path = Path(path_or_name).expanduser()
-        text = os.fspath(path_or_name)
-        is_bare_name = isinstance(path_or_name, str) and not {"/", os.sep} & set(text) and text not in (".", "..")
-        if path.is_file() and path.suffix.lower() == ".csv":
-            return map_io.read_tum_centerline(path)
-        # A folder that merely shares a track's name is not that track.
-        if path.is_dir() and not (is_bare_name and map_io.find_yaml_files(path) == []):
-            return map_io.read_track(path)
-        if is_bare_name and not path.is_file():
-            from outlap.track.catalog import find_track
-
-            return find_track(text)
-        what = "is neither a map folder nor a centreline .csv" if path.is_file() else "does not exist"
-        raise OutlapError(f"{path}: {what}; give a map folder, a centreline .csv or a track's name")
-
-    def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write the track to `folder` in the F1TENTH format; returns the folder."""
-        from outlap.track import map_io
-
-        return map_io.write_track(self, folder)
 
     def reversed(self) -> Track:
         """The same circuit driven the other way round; the racing line, made for this way, is left out."""
@@ -136,13 +104,6 @@ class Track:
         y = np.asarray(y, dtype=np.float64) - self.origin[1]
         cos, sin = math.cos(self.origin[2]), math.sin(self.origin[2])
         return (cos * x + sin * y) / self.resolution, (cos * y - sin * x) / self.resolution
-
-    def grid_to_world(self, col: ArrayLike, row: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """(column, row) as floats → map frame [m]; a pixel's centre is at its index + 0.5."""
-        u = np.asarray(col, dtype=np.float64) * self.resolution
-        v = np.asarray(row, dtype=np.float64) * self.resolution
-        cos, sin = math.cos(self.origin[2]), math.sin(self.origin[2])
-        return self.origin[0] + cos * u - sin * v, self.origin[1] + sin * u + cos * v
 
     def is_wall(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Whether each point (map frame, [m]) lies in a wall; outside the map counts as wall."""

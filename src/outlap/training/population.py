@@ -91,7 +91,7 @@ def train_opponent(
     Args:
         opponent: which.
         settings: of the trainings of all opponents.
-        track: name that `Track.load` finds it by.
+        track: name that `load_track` finds it by.
         folder: of the run.
         on_steps: called with the steps so far; may raise KeyboardInterrupt, which passes through once a checkpoint is
             written.

@@ -16,10 +16,11 @@ from tyro.conf import arg
 
 from outlap.config import Config
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.tasks import TaskSet, TaskSplit, load_tracks
+from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
 from outlap.files import remove_partials
+from outlap.track.catalog import load_tracks
 from outlap.training.device import check_device
 from outlap.training.model_file import load_model
 from outlap.training.run import Run, create_run, save_checkpoint
