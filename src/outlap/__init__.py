@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from outlap.threads import wait_without_spinning
+
 if TYPE_CHECKING:
     from outlap.errors import OutlapError
     from outlap.simulator.simulator import Simulator
@@ -13,6 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = ["OutlapError", "Simulator", "Track", "load_track"]
 __version__ = version("outlap")
+
+wait_without_spinning()  # before Numba and PyTorch load OpenMP
 
 try:
     import gymnasium
