@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
-import tempfile
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from tempfile import TemporaryDirectory
 
 import platformdirs
+from filelock import FileLock, Timeout
 
 from outlap.errors import OutlapError
 
@@ -25,18 +23,18 @@ STAGING_PREFIX = ".staging-"
 
 
 def cache_root() -> Path:
-    """`$OUTLAP_CACHE`, or outlap's folder in the platform's user cache; may not exist."""
+    """Return `$OUTLAP_CACHE`, or outlap's folder in the platform's user cache; it may not exist."""
     return Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("outlap", appauthor=False)).expanduser()
 
 
 def cache_folder() -> Path:
-    """The folder of cached tracks, in `cache_root`; may not exist."""
+    """Return the folder of cached tracks, in `cache_root`; it may not exist."""
     return cache_root() / "tracks"
 
 
 @contextmanager
 def staging(folder: Path, wait_s: float = 600.0) -> Iterator[Path]:
-    """Hold the write lock of `folder` (made if need be) and give a fresh hidden folder inside it.
+    """Hold the write lock of `folder`, which is made if need be, and yield a new hidden folder inside it.
 
     The hidden folder is on the same file system, so that `install` is one rename, and is removed at the end.
 
@@ -45,60 +43,30 @@ def staging(folder: Path, wait_s: float = 600.0) -> Iterator[Path]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("a+b")
+        lock = FileLock(folder / ".lock", timeout=wait_s).acquire()
+    except Timeout:
+        raise OutlapError(
+            f"{folder}: another process has been writing here for more than {wait_s:.0f} s; wait for it, or end it"
+        ) from None
     except OSError as error:
         raise OutlapError(
             f"{folder}: cannot write here ({error.strerror}); set {CACHE_VARIABLE} to a folder that you can write to"
         ) from error
     with lock:
-        _wait_for(lock, folder, wait_s)
         for leftover in folder.glob(f"{STAGING_PREFIX}*"):
             shutil.rmtree(leftover, ignore_errors=True)
-        prepared = Path(tempfile.mkdtemp(prefix=STAGING_PREFIX, dir=folder))
-        try:
-            yield prepared
-        finally:
-            shutil.rmtree(prepared, ignore_errors=True)
+        with TemporaryDirectory(prefix=STAGING_PREFIX, dir=folder, ignore_cleanup_errors=True) as prepared:
+            yield Path(prepared)
 
 
 def install(prepared: Path, target: Path) -> Path:
-    """Rename the folder `prepared`, which lies in a staging folder, to `target`, replacing what is there."""
+    """Rename the folder `prepared`, which lies in a staging folder, to `target`, and replace what is there."""
     prepared.chmod(0o755)
     if not target.exists():
         return prepared.rename(target)
-    replaced = prepared.with_name("replaced")  # goes away with the staging folder
-    target.rename(replaced)
+    replaced = target.rename(prepared.with_name("replaced"))  # removed with the staging folder
     try:
         return prepared.rename(target)
     except OSError:
         replaced.rename(target)
         raise
-
-
-def _wait_for(lock: IO[bytes], folder: Path, wait_s: float) -> None:
-    give_up = time.monotonic() + wait_s
-    while not _try_lock(lock):
-        if time.monotonic() >= give_up:
-            raise OutlapError(
-                f"{folder}: another process has been writing here for more than {wait_s:.0f} s; wait for it, or end it"
-            )
-        time.sleep(0.1)
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _try_lock(lock: IO[bytes]) -> bool:
-        lock.seek(0)
-        with suppress(OSError):
-            msvcrt.locking(lock.fileno(), msvcrt.LK_NBLCK, 1)
-            return True
-        return False
-else:
-    import fcntl
-
-    def _try_lock(lock: IO[bytes]) -> bool:
-        with suppress(BlockingIOError):
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return True
-        return False

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import datetime
-import json
 import re
 import sys
 import urllib.parse
 from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from outlap.errors import OutlapError
+from pydantic import Field, TypeAdapter
+
+from outlap.config import Config
+from outlap.errors import OutlapError, brief
 from outlap.files import atomic_write
 from outlap.track.archive import ArchiveLimits, extract
 from outlap.track.cache import cache_folder, install, staging
@@ -21,19 +22,24 @@ from outlap.track.catalog import OFFICIAL_TRACKS, is_track_folder, name_key
 from outlap.track.map_io import read_track
 from outlap.track.transfer import Patience, Progress, UnreachableError, fetch
 
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+
 ARCHIVE_URL = "https://api.f1tenth.org/{name}.tar.xz"
 LOCK_FILE = "tracks.lock.json"
 _OFFICIAL = ", ".join(OFFICIAL_TRACKS)
 
 
-@dataclass(frozen=True)
-class LockedArchive:
+class LockedArchive(Config):
     """What an archive was when it was first downloaded; a later download must be the same bytes."""
 
     url: str
-    sha256: str  # 64 hex digits
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     size_bytes: int
     date: str  # ISO 8601, UTC
+
+
+_LOCK = TypeAdapter(dict[str, LockedArchive])
 
 
 @dataclass(frozen=True)
@@ -72,24 +78,25 @@ def download_tracks(
     Raises:
         OutlapError: one or more names failed; those that did not are in the cache all the same.
     """
-    cache = cache or cache_folder()
-    limits = limits or ArchiveLimits()
-    official = [_official_name(name) for name in names]
+    job = _Job(cache or cache_folder(), update_lock, limits or ArchiveLimits(), patience or Patience())
+    official = dict.fromkeys(_official_name(name) for name in names)
     done: list[DownloadedTrack] = []
     failures: list[OutlapError] = []
-    for name in dict.fromkeys(official):
-        url = url_template.replace("{name}", urllib.parse.quote(name))
-        try:
-            with _progress_bar(name, show_progress) as progress:
-                track = _download(name, url, cache, update_lock, limits, patience, progress)
-            done.append(track)
-        except UnreachableError:
-            raise  # the others come from the same server
-        except OSError as error:  # no space, for example: that ends them all
-            raise OutlapError(f"{cache}: cannot be written ({error.strerror or error})") from error
-        except OutlapError as error:
-            hint = "" if name in OFFICIAL_TRACKS else f"; the official tracks are {_OFFICIAL}"
-            failures.append(OutlapError(f"{error}{hint}"))
+    with _progress_bars(show_progress) as bars:
+        for name in official:
+            bar = bars.add_task(name, total=None)
+            try:
+                url = url_template.replace("{name}", urllib.parse.quote(name))
+                done.append(
+                    job.download(name, url, lambda size, total, bar=bar: bars.update(bar, completed=size, total=total))
+                )
+            except UnreachableError:
+                raise  # the others come from the same server
+            except OSError as error:  # no space, for example: that ends them all
+                raise OutlapError(f"{job.cache}: cannot be written ({error.strerror or error})") from error
+            except OutlapError as error:
+                hint = "" if name in OFFICIAL_TRACKS else f"; the official tracks are {_OFFICIAL}"
+                failures.append(OutlapError(f"{error}{hint}"))
     if len(failures) == 1:
         raise failures[0]
     if failures:
@@ -106,60 +113,57 @@ def read_lock(cache: Path) -> dict[str, LockedArchive]:
     """
     path = cache / LOCK_FILE
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-        locked = {name: LockedArchive(**entry) for name, entry in entries.items()}
-        for archive in locked.values():
-            if not re.fullmatch("[0-9a-f]{64}", archive.sha256):
-                raise ValueError(f"sha256 is {archive.sha256!r}")
+        return _LOCK.validate_json(path.read_bytes())
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise OutlapError(f"{path}: not a lock file of outlap ({error}); mend it or delete it") from error
-    return locked
+    except (OSError, ValueError) as error:
+        raise OutlapError(f"{path}: not a lock file of outlap ({brief(error)}); mend it or delete it") from error
 
 
-def _download(
-    name: str,
-    url: str,
-    cache: Path,
-    update_lock: bool,
-    limits: ArchiveLimits,
-    patience: Patience | None,
-    progress: Progress | None,
-) -> DownloadedTrack:
-    folder = cache / name
-    with staging(cache) as prepared:
-        locked = read_lock(cache)
-        if folder.exists():
-            if name not in locked:
-                raise OutlapError(f"{folder}: is there and was not downloaded; move it away to download {name}")
-            if not update_lock:
-                return DownloadedTrack(name, folder, "present", locked[name])
+@dataclass(frozen=True)
+class _Job:
+    """What the downloads of one call have in common."""
 
-        archive = prepared / "archive.tar.xz"
-        sha256, size = fetch(url, archive, limits.packed, patience, progress)
-        if name in locked and sha256 != locked[name].sha256 and not update_lock:
-            raise OutlapError(
-                f"{url}: sha256 is {sha256}, but {cache / LOCK_FILE} has {locked[name].sha256} "
-                f"of {locked[name].date}; if the change is meant, run again with --update-lock"
-            )
+    cache: Path
+    update_lock: bool
+    limits: ArchiveLimits
+    patience: Patience
 
-        content = prepared / "content"
-        content.mkdir()
-        extract(archive, content, limits, called=url)
-        track_folder = _only_track_folder(content, url)
-        try:
-            read_track(track_folder)
-        except OutlapError as error:
-            raise OutlapError(f"{url}: {str(error).replace(f'{content}/', '')}") from error
+    def download(self, name: str, url: str, progress: Progress) -> DownloadedTrack:
+        folder = self.cache / name
+        with staging(self.cache) as prepared:
+            locked = read_lock(self.cache)
+            known = locked.get(name)
+            if folder.exists():
+                if known is None:
+                    raise OutlapError(f"{folder}: is there and was not downloaded; move it away to download {name}")
+                if not self.update_lock:
+                    return DownloadedTrack(name, folder, "present", known)
 
-        # The digest before the track: after a kill between the two, the next download is still checked.
-        if name not in locked or locked[name].sha256 != sha256:
-            now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-            locked[name] = LockedArchive(url, sha256, size, now)
-            _write_lock(cache, locked)
-        install(track_folder, folder)
-    return DownloadedTrack(name, folder, "downloaded", locked[name])
+            archive = prepared / "archive.tar.xz"
+            sha256, size = fetch(url, archive, self.limits.packed, self.patience, progress)
+            changed = known is None or known.sha256 != sha256
+            if known and changed and not self.update_lock:
+                raise OutlapError(
+                    f"{url}: sha256 is {sha256}, but {self.cache / LOCK_FILE} has {known.sha256} "
+                    f"of {known.date}; if the change is meant, run again with --update-lock"
+                )
+            content = prepared / "content"
+            content.mkdir()
+            extract(archive, content, self.limits, called=url)
+            track_folder = _only_track_folder(content, url)
+            try:
+                read_track(track_folder)
+            except OutlapError as error:
+                raise OutlapError(f"{url}: {str(error).replace(f'{content}/', '')}") from error
+
+            # The digest before the track: after a kill between the two, the next download is still checked.
+            if changed:
+                now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+                locked[name] = LockedArchive(url=url, sha256=sha256, size_bytes=size, date=now)
+                _write_lock(self.cache, locked)
+            install(track_folder, folder)
+        return DownloadedTrack(name, folder, "downloaded", locked[name])
 
 
 def _official_name(name: str) -> str:
@@ -183,34 +187,14 @@ def _only_track_folder(content: Path, url: str) -> Path:
 
 
 def _write_lock(cache: Path, locked: dict[str, LockedArchive]) -> None:
-    rows = {name: asdict(archive) for name, archive in sorted(locked.items())}
-    atomic_write(cache / LOCK_FILE, json.dumps(rows, indent=2) + "\n")
+    atomic_write(cache / LOCK_FILE, _LOCK.dump_json(dict(sorted(locked.items())), indent=2) + b"\n")
 
 
-class _Bar(AbstractContextManager[Progress]):
-    """A rich progress bar as a `Progress` callback."""
+def _progress_bars(shown: bool) -> RichProgress:
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, TransferSpeedColumn
+    from rich.progress import Progress as RichProgress
 
-    def __init__(self, name: str) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            DownloadColumn(),
-            TransferSpeedColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        )
-        self._task = self._bar.add_task(name, total=None)
-
-    def __enter__(self) -> Progress:
-        self._bar.start()
-        return lambda size, total: self._bar.update(self._task, completed=size, total=total)
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.stop()
-
-
-def _progress_bar(name: str, wanted: bool) -> AbstractContextManager[Progress | None]:
-    return _Bar(name) if wanted and sys.stderr.isatty() else nullcontext()
+    columns = ("{task.description}", BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    hidden = not (shown and sys.stderr.isatty())
+    return RichProgress(*columns, console=Console(stderr=True), transient=True, disable=hidden)
