@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from outlap.config import Config
-from outlap.simulator.vehicle import ActuatorParams, LidarParams, PacejkaTyre, VehicleParams, parameter_bounds
+from outlap.simulator.vehicle import (
+    ActuatorParams,
+    LidarParams,
+    PacejkaTyre,
+    VehicleParams,
+    parameter_bounds,
+    to_records,
+)
 from outlap.track.centerline import Centerline
 from outlap.track.generate import generate_track
 from outlap.track.track import Track
@@ -100,13 +107,14 @@ def car_config(odd: dict[tuple[str, str], Any]) -> dict[str, Any]:
 
 @st.composite
 def rows(draw: st.DrawFn) -> np.ndarray:
-    """The parameter row of any car."""
+    """The parameters of any car."""
     config = car_config({field: value_at(*field, share) for field, share in draw(oddities).items()})
-    return parameter_bounds(
+    values, _ = parameter_bounds(
         VehicleParams.model_validate(config["vehicle"]),
         ActuatorParams.model_validate(config["actuators"]),
         LidarParams.model_validate(config["lidar"]),
-    )[0]
+    )
+    return to_records(values)
 
 
 @cache

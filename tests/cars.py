@@ -1,4 +1,4 @@
-"""Cars for the tests of the dynamics: the CommonRoad package's, and ours as float64 parameter rows."""
+"""Cars for the tests of the dynamics: the CommonRoad package's, and ours as records of float64 parameters."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 
-from outlap.simulator import vehicle as column
 from outlap.simulator.dynamics import kinematic_speed, kinematic_values, rolling_wheel_speeds
-from outlap.simulator.vehicle import PRESETS, PacejkaTyre, VehicleParams, parameter_bounds
+from outlap.simulator.vehicle import NAMES, PRESETS, PacejkaTyre, VehicleParams, parameter_bounds, to_records
 
+PRECISE = np.dtype([(name, np.float64) for name in NAMES])
 SMALL_CAR = 0  # the package has no 1:10 car: its BMW with the F1TENTH car's numbers
 
 
@@ -34,33 +34,44 @@ def package_car(number: int) -> Any:
     return car
 
 
-def row_of(car) -> np.ndarray:
-    """The package's parameters as our row, in float64."""
-    row = parameter_bounds(VehicleParams())[0].astype(np.float64)
+def precise(values: np.ndarray) -> np.void:
+    """Parameters (N_PARAMS,) as a record of float64."""
+    return values.astype(np.float64).view(PRECISE)[0]
+
+
+def single(row: np.void) -> np.void:
+    """A record of float64 as the simulator's."""
+    record: Any = to_records(np.array(list(row.item())))[()]
+    return record
+
+
+def row_of(car) -> np.void:
+    """The package's parameters as our record, in float64."""
+    row = precise(parameter_bounds(VehicleParams())[0])
     for name in PacejkaTyre.model_fields:
-        row[getattr(column, name.upper())] = getattr(car.tire, name)
-    row[column.MU] = car.tire.p_dy1
-    row[[column.C_SF, column.C_SR]] = -car.tire.p_ky1 / car.tire.p_dy1
-    row[[column.LF, column.LR, column.H, column.M, column.I]] = car.a, car.b, car.h_s, car.m, car.I_z
-    row[[column.WHEEL_RADIUS, column.WHEEL_INERTIA]] = car.R_w, car.I_y_w
-    row[[column.BRAKE_SPLIT, column.ENGINE_SPLIT]] = car.T_sb, car.T_se
-    row[[column.STEER_MIN, column.STEER_MAX]] = car.steering.min, car.steering.max
-    row[column.STEER_RATE_MAX] = car.steering.v_max
+        row[name] = getattr(car.tire, name)
+    row["mu"] = car.tire.p_dy1
+    row["C_Sf"] = row["C_Sr"] = -car.tire.p_ky1 / car.tire.p_dy1
+    row["lf"], row["lr"], row["h"], row["m"], row["I"] = car.a, car.b, car.h_s, car.m, car.I_z
+    row["wheel_radius"], row["wheel_inertia"] = car.R_w, car.I_y_w
+    row["brake_split"], row["engine_split"] = car.T_sb, car.T_se
+    row["steer_min"], row["steer_max"] = car.steering.min, car.steering.max
+    row["steer_rate_max"] = car.steering.v_max
     limits = car.longitudinal
-    row[[column.V_MIN, column.V_MAX, column.V_SWITCH]] = limits.v_min, limits.v_max, limits.v_switch
-    row[column.A_MAX] = limits.a_max
-    row[column.KINEMATIC_SPEED] = 0.1  # the package's switch
+    row["v_min"], row["v_max"], row["v_switch"] = limits.v_min, limits.v_max, limits.v_switch
+    row["a_max"] = limits.a_max
+    row["kinematic_speed"] = 0.1  # the package's switch
     return row
 
 
-def small_row(dt: float = 0.01, **changes: float) -> np.ndarray:
+def small_row(dt: float = 0.01, **changes: float) -> np.void:
     """The F1TENTH car, ready to drive."""
-    row = parameter_bounds(PRESETS["f1tenth"].model_copy(update=changes))[0].astype(np.float64)
-    row[column.KINEMATIC_SPEED] = kinematic_speed(row, dt)
+    row = precise(parameter_bounds(PRESETS["f1tenth"].model_copy(update=changes))[0])
+    row["kinematic_speed"] = kinematic_speed(row, dt)
     return row
 
 
-def rolling(speed: float, row: np.ndarray, steer: float = 0.0) -> tuple[float, ...]:
+def rolling(speed: float, row: np.void, steer: float = 0.0) -> tuple[float, ...]:
     """A state at the origin whose wheels do not slip."""
     yaw_rate, slip = kinematic_values(steer, speed, row)
     front, rear = rolling_wheel_speeds(steer, speed, yaw_rate, slip, row)

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from outlap.simulator.kernels import Worlds
 from outlap.simulator.simulator import Simulator, SimulatorConfig
 from outlap.simulator.state import YAW, X, Y
-from outlap.simulator.vehicle import N_PARAMS, STEER_MAX, STEER_MIN, V_MAX, V_MIN, VehicleParams, parameter_bounds
+from outlap.simulator.vehicle import N_PARAMS, VehicleParams, parameter_bounds, to_records, to_values
 from outlap.track.centerline import Centerline
 from outlap.track.track import Track
 
-CAR = parameter_bounds(VehicleParams())[0]  # the parameter row of the F1TENTH car
+CAR = to_records(parameter_bounds(VehicleParams())[0])  # the parameters of the F1TENTH car
 
 
 def circle(x: float, y: float, radius: float, half_width: float = 1.0) -> Centerline:
@@ -89,7 +89,7 @@ def place(
     Args:
         tracks: one track, or several of which `which_track` (worlds,) says which.
         poses: (worlds, cars, 3) x [m], y [m], yaw [rad].
-        speed, params: broadcast to (worlds, cars) and (worlds, cars, N_PARAMS).
+        speed, params: broadcast to (worlds, cars) and (worlds, cars).
         keys: (worlds,) of the sensor noise.
         config: of `SimulatorConfig`.
     """
@@ -105,7 +105,7 @@ def place(
         np.arange(worlds),
         keys=np.arange(worlds, dtype=np.uint64) if keys is None else np.asarray(keys, np.uint64),
         tracks=which_track,
-        params=np.broadcast_to(params, (worlds, cars, len(CAR))),
+        params=np.broadcast_to(params, (worlds, cars)),
         starts=starts,
     )
     off = sim.worlds.state[..., [X, Y, YAW]] - poses
@@ -115,17 +115,17 @@ def place(
 
 
 def random_cars(rng: np.random.Generator, worlds: int, cars: int) -> np.ndarray:
-    """Parameter rows within 30 % of the F1TENTH car's."""
-    params = CAR * rng.uniform(0.7, 1.3, (worlds, cars, N_PARAMS))
-    return params.astype(np.float32)
+    """Parameters within 30 % of the F1TENTH car's."""
+    values = to_values(CAR) * rng.uniform(0.7, 1.3, (worlds, cars, N_PARAMS))
+    return to_records(values)
 
 
 def random_commands(rng: np.random.Generator, params: np.ndarray) -> np.ndarray:
     """At or near the limits of each car, both ways, or nothing: (worlds, cars, 2)."""
-    choice = rng.integers(0, 3, params.shape[:-1])
-    steer = np.choose(choice, [params[..., STEER_MIN], params[..., STEER_MAX], 0.0 * choice])
-    choice = rng.integers(0, 4, params.shape[:-1])
-    speed = np.choose(choice, [params[..., V_MIN], params[..., V_MAX], 0.0 * choice, 0.4 * params[..., V_MAX]])
+    choice = rng.integers(0, 3, params.shape)
+    steer = np.choose(choice, [params["steer_min"], params["steer_max"], 0.0 * choice])
+    choice = rng.integers(0, 4, params.shape)
+    speed = np.choose(choice, [params["v_min"], params["v_max"], 0.0 * choice, 0.4 * params["v_max"]])
     return np.stack([steer, speed], axis=-1)
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from outlap.envs.actions import commands, speed_spans
 from outlap.envs.race_vector_env import RaceVectorEnv
-from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
 
 
 def row(**changes: Any) -> np.ndarray:
-    return parameter_bounds(VehicleParams(**changes))[0]
+    return to_records(parameter_bounds(VehicleParams(**changes))[0])
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ def test_the_stops_of_an_asymmetrical_steering_are_at_plus_and_minus_one(steer, 
 )
 def test_the_second_number_spans_the_speed_range_or_the_cars_own(speed_range, low, high):
     actions = np.array([[0.0, -1.0], [0.0, 0.0], [0.0, 0.5], [0.0, 1.0]])
-    params = np.tile(row(), (4, 1))
+    params = np.full(4, row())
     command = commands(actions, params, speed_spans(params, speed_range))
     expected = [low, (low + high) / 2, low + 0.75 * (high - low), high]
     np.testing.assert_allclose(command[:, 1], expected, rtol=1e-6)
@@ -39,7 +39,7 @@ def test_the_second_number_spans_the_speed_range_or_the_cars_own(speed_range, lo
 
 def test_every_car_has_its_own_limits():
     params = np.stack([row(steer_max=0.3, v_min=-1.0, v_max=5.0), row(steer_max=0.5, v_min=0.0, v_max=9.0)])
-    params = np.broadcast_to(params, (3, 2, params.shape[1]))
+    params = np.broadcast_to(params, (3, 2))
     command = commands(np.ones((3, 2, 2)), params, speed_spans(params, None))
     np.testing.assert_allclose(command, np.broadcast_to([[0.3, 5.0], [0.5, 9.0]], (3, 2, 2)), rtol=1e-6)
     assert command.dtype == np.float32

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
-from outlap.simulator.vehicle import N_PARAMS, V_MAX
+from outlap.simulator.vehicle import N_PARAMS, to_values
 
 
 def test_the_final_infos_numbers(ellipse, follow):
@@ -123,7 +123,7 @@ def test_info_tells_the_task(ellipse, circle):
     worlds = env.race.worlds
     names = [env.race.simulator.tracks[number].name for number in worlds.track]
     np.testing.assert_array_equal(info["track"], names)
-    np.testing.assert_array_equal(info["vehicle"], worlds.params)
+    np.testing.assert_array_equal(info["vehicle"], to_values(worlds.params))
     speeds = info["opponent_speed_mps"]
     assert speeds.shape == (5, 1)
     assert len(np.unique(speeds)) == 5
@@ -144,7 +144,7 @@ def test_opponents_follow_the_track_at_their_own_speed(ellipse, circle, big_circ
     put(env, starts)
     speeds = np.sort(env.reset(seed=0)[1]["opponent_speed_mps"], axis=1)
     put(env, starts)
-    env.race.speeds[:, 1:, 1] = env.race.worlds.params[:, 1:, V_MAX] = speeds[:, ::-1]  # the leader is the faster one
+    env.race.speeds[:, 1:, 1] = env.race.worlds.params["v_max"][:, 1:] = speeds[:, ::-1]  # the leader is the faster one
     fastest = np.zeros((6, 2))
     for _ in range(350):
         _, _, terminated, truncated, info = env.step(np.tile([0.0, -0.6], (6, 1)))

@@ -12,7 +12,6 @@ from outlap.envs.observations import CURVATURE_AHEAD, LINE_AHEAD, OBSERVATION_TE
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 from outlap.simulator.lidar import beam_directions
-from outlap.simulator.vehicle import STEER_MAX, V_MAX, V_MIN
 
 ALL = tuple(OBSERVATION_TERMS)
 
@@ -93,9 +92,9 @@ def test_the_action_span_is_what_the_extremes_command(driven):
     env, observation, _ = driven
     params = env.race.worlds.params[:, 0]
     lock, slowest, fastest = observation["action_span"].T
-    np.testing.assert_array_equal(lock, params[:, STEER_MAX])
-    np.testing.assert_array_equal(slowest, params[:, V_MIN])
-    np.testing.assert_array_equal(fastest, params[:, V_MAX])
+    np.testing.assert_array_equal(lock, params["steer_max"])
+    np.testing.assert_array_equal(slowest, params["v_min"])
+    np.testing.assert_array_equal(fastest, params["v_max"])
 
 
 def test_frenet_agrees_with_the_projection_on_the_spline(driven, ellipse):

@@ -14,7 +14,7 @@ from outlap.envs.race_env import RaceEnv
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_PRESETS
 from outlap.errors import OutlapError
-from outlap.simulator.vehicle import A_MAX, MU, V_MAX, V_MIN, M
+from outlap.simulator.vehicle import to_records
 
 
 def test_the_papers_vehicle(ellipse):
@@ -28,7 +28,8 @@ def test_the_papers_vehicle(ellipse):
     }  # fmt: skip
     assert {name: vehicle[name] for name in expected} == expected
     _, info = env.reset(seed=0)
-    np.testing.assert_allclose(info["vehicle"][0, 0, [MU, A_MAX, V_MIN, V_MAX]], [0.8, 6.34, -8.0, 8.0], rtol=1e-6)
+    car = to_records(info["vehicle"][0, 0])[["mu", "a_max", "v_min", "v_max"]].item()
+    np.testing.assert_allclose(car, [0.8, 6.34, -8.0, 8.0], rtol=1e-6)
 
 
 def test_a_preset_with_changes(ellipse):
@@ -37,11 +38,12 @@ def test_a_preset_with_changes(ellipse):
         vehicle={"preset": "paper", "mu": {"min": 0.5, "max": 1.1}, "m": 4.0, "tyre": {"p_dy1": 0.9}},
     )  # fmt: skip
     _, info = env.reset(seed=0)
-    rows = info["vehicle"][:, 0]
-    np.testing.assert_allclose(rows[:, [A_MAX, V_MAX, M]], np.tile([6.34, 8.0, 4.0], (64, 1)), rtol=1e-6)
-    assert rows[:, MU].min() >= 0.5
-    assert rows[:, MU].max() <= np.float32(1.1)
-    assert len(np.unique(rows[:, MU])) == 64
+    cars = to_records(info["vehicle"][:, 0])
+    for name, value in (("a_max", 6.34), ("v_max", 8.0), ("m", 4.0)):
+        np.testing.assert_allclose(cars[name], value, rtol=1e-6)
+    assert cars["mu"].min() >= 0.5
+    assert cars["mu"].max() <= np.float32(1.1)
+    assert len(np.unique(cars["mu"])) == 64
     assert env.config.vehicle.mu == (0.5, 1.1)
     assert env.config.vehicle.tyre.p_dy1 == 0.9
 

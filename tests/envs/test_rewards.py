@@ -14,7 +14,6 @@ from outlap.planning.kept import kept_line
 from outlap.planning.limits import Limits
 from outlap.planning.plan import DEFAULT_MARGIN
 from outlap.simulator.atlas import FIRST_ROW, ROWS
-from outlap.simulator.vehicle import MU
 from outlap.track.generate import generate_track
 
 STANDSTILL = -0.6  # the speed action that stands for 0 m/s between -5 and 20
@@ -201,7 +200,7 @@ def test_the_reference_speed_is_that_of_the_very_car(big_circle):
     race = env.race
     assert race.reference is not None
     speeds = race.reference.at(0, race.worlds.track, race.line_rows(0, np.zeros(1))[:, 0])
-    mu = race.worlds.params[:, 0, MU]
+    mu = race.worlds.params["mu"][:, 0]
     np.testing.assert_allclose(speeds**2 / mu, (speeds**2 / mu)[0], rtol=2e-2)
     assert mu.max() - mu.min() > 0.2
 
@@ -216,7 +215,7 @@ def test_the_reference_is_that_of_the_place_and_of_the_track():
     atlas = race.simulator.atlas
     for world, number in enumerate(race.worlds.track.tolist()):
         track, (first, rows) = tracks[number], atlas.index[number, [FIRST_ROW, ROWS]]
-        line = kept_line(track, Limits.of_row(race.worlds.params[world, 0]))
+        line = kept_line(track, Limits.of_record(race.worlds.params[world, 0]))
         at, _ = track.centerline.to_frenet(*line.path.points.T)
         for row in range(0, rows, 40):
             everyone = np.full(8, atlas.index[race.worlds.track, FIRST_ROW])

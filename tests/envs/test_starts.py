@@ -13,10 +13,14 @@ from scipy import stats
 
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
-from outlap.simulator.vehicle import LENGTH, WIDTH
 from outlap.track.centerline import Centerline
 from outlap.track.track import Track
 from outlap.track.walls import draw_walls
+
+
+def sizes_of(params: np.ndarray) -> np.ndarray:
+    """Length and width of cars (...): (..., 2) [m]."""
+    return np.stack([params["length"], params["width"]], axis=-1).astype(float)
 
 
 def corners(pose: np.ndarray, length: float, width: float) -> np.ndarray:
@@ -44,7 +48,7 @@ def starts(env: RaceVectorEnv, resets: int) -> tuple[np.ndarray, np.ndarray]:
         env.reset(seed=0) if reset == 0 else env.reset()
         assert not env.race.worlds.contact.any()
         poses.append(env.race.worlds.state[..., [0, 1, 4]].astype(float))
-        sizes.append(env.race.worlds.params[..., [LENGTH, WIDTH]].astype(float))
+        sizes.append(sizes_of(env.race.worlds.params))
     return np.stack(poses), np.stack(sizes)
 
 
@@ -61,7 +65,7 @@ def test_no_start_touches_anything(ellipse, circle, cars):
         for world in range(50):
             track = env.race.simulator.tracks[env.race.worlds.track[world]]
             poses = env.race.worlds.state[world][:, [0, 1, 4]].astype(float)
-            sizes = env.race.worlds.params[world][:, [LENGTH, WIDTH]].astype(float)
+            sizes = sizes_of(env.race.worlds.params[world])
             bodies = [corners(pose, *size) for pose, size in zip(poses, sizes, strict=True)]
             for body in bodies:
                 edge = np.concatenate([np.linspace(a, b, 9) for a, b in zip(body, np.roll(body, 1, 0), strict=True)])
@@ -193,7 +197,7 @@ def test_no_formation_ever_starts_with_a_contact(big_circle, formation, cars, of
     assert not env.race.worlds.contact.any()
     for poses, sizes in zip(
         env.race.worlds.state[..., [0, 1, 4]].astype(float),
-        env.race.worlds.params[..., [LENGTH, WIDTH]].astype(float),
+        sizes_of(env.race.worlds.params),
         strict=True,
     ):
         bodies = [corners(pose, *size) for pose, size in zip(poses, sizes, strict=True)]

@@ -13,8 +13,16 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.errors import OutlapError
 from outlap.seeding import world_keys
-from outlap.simulator import vehicle as column
-from outlap.simulator.vehicle import KINEMATIC_SPEED, N_PARAMS, ActuatorParams, LidarParams, PacejkaTyre, VehicleParams
+from outlap.simulator.vehicle import (
+    N_PARAMS,
+    NAMES,
+    ActuatorParams,
+    LidarParams,
+    PacejkaTyre,
+    VehicleParams,
+    to_records,
+    to_values,
+)
 from outlap.track import catalog
 from outlap.track.catalog import load_tracks
 from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN
@@ -26,8 +34,7 @@ FIELDS = [(part, name) for part, cls in PARTS.items() for name in cls.model_fiel
 
 
 def test_there_is_a_field_for_every_column():
-    columns = sorted(getattr(column, name.upper()) for _, name in FIELDS)
-    assert columns == [number for number in range(N_PARAMS) if number != KINEMATIC_SPEED]
+    assert sorted(name for _, name in FIELDS) == sorted(set(NAMES) - {"kinematic_speed"})
 
 
 def with_range(part: str, name: str) -> tuple[dict, float, float]:
@@ -47,8 +54,9 @@ def test_a_parameter_with_a_range_is_uniform_in_it_and_the_others_stay(ellipse, 
     worlds, episodes = 400, 3
     keys = world_keys(range(worlds))
     draws = [TaskSet((ellipse,), **config).draw(keys, np.full(worlds, e), 2)[1] for e in range(1, episodes + 1)]
-    params = np.stack(draws)  # (episodes, worlds, cars, N_PARAMS)
-    chosen = getattr(column, name.upper())
+    params = to_values(np.stack(draws))  # (episodes, worlds, cars, N_PARAMS)
+    fixed = to_values(fixed)
+    chosen = NAMES.index(name)
     others = np.delete(np.arange(N_PARAMS), chosen)
     np.testing.assert_array_equal(params[..., others], np.broadcast_to(fixed[others], params[..., others].shape))
 
@@ -67,7 +75,7 @@ def test_parameters_are_independent_of_each_other_and_of_the_track(ellipse, circ
     vehicle = VehicleParams(mu=(0.5, 1.1), m=(3.0, 4.0))
     tasks = TaskSet((ellipse, circle), vehicle, lidar=LidarParams(noise_std=(0.0, 0.1)))
     tracks, params = tasks.draw(world_keys(range(3000)), np.ones(3000, int), 1)
-    drawn = np.stack([tracks, *params[:, 0, [column.MU, column.M, column.NOISE_STD]].T])
+    drawn = np.stack([tracks, *(params[name][:, 0] for name in ("mu", "m", "noise_std"))])
     off_diagonal = np.corrcoef(drawn)[np.triu_indices(4, 1)]
     assert np.abs(off_diagonal).max() < 0.09  # 5 sigma
 
@@ -101,12 +109,12 @@ def test_the_environment_draws_anew_in_every_episode(ellipse):
     frictions, previous = [], None
     for _ in range(20):
         vehicle = info["vehicle"]
-        np.testing.assert_array_equal(vehicle, env.race.worlds.params)
+        np.testing.assert_array_equal(vehicle, to_values(env.race.worlds.params))
         assert vehicle.shape == (30, 2, N_PARAMS)
-        np.testing.assert_array_equal(vehicle[..., column.M], np.float32(3.74))
+        np.testing.assert_array_equal(to_records(vehicle)["m"], np.float32(3.74))
         if previous is not None:
-            assert (vehicle[..., column.MU] != previous[..., column.MU]).all()
-        frictions.append(vehicle[..., column.MU])
+            assert (to_records(vehicle)["mu"] != to_records(previous)["mu"]).all()
+        frictions.append(to_records(vehicle)["mu"])
         previous = vehicle.copy()
         env.step(np.zeros((30, 2)))
         *_, info = env.step(np.zeros((30, 2)))
@@ -122,7 +130,7 @@ def test_friction_reaches_the_tyres(big_circle, put):
     for mu in (0.2, 1.0489):
         env.reset(seed=0)
         params = env.race.worlds.params.copy()
-        params[..., column.MU] = mu
+        params["mu"] = mu
         put(env, [0.0, 0.6, 0.0, 6.0], params)
         for _ in range(40):
             env.step(np.array([[0.1, -0.12]]))
@@ -134,7 +142,7 @@ def test_an_actuator_delay_is_drawn_and_holds_the_command_back(ellipse):
     """Full lock at once: the wheels move after each world's own delay."""
     env = RaceVectorEnv(24, tracks=[ellipse], beams=0, actuators={"steer_delay": (0.0, 0.08)})
     _, info = env.reset(seed=3)
-    delay = info["vehicle"][:, 0, column.STEER_DELAY]
+    delay = to_records(info["vehicle"])["steer_delay"][:, 0]
     assert len(np.unique(delay)) == 24
     first = np.full(24, -1)
     for step in range(12):
@@ -152,7 +160,7 @@ def test_noise_and_mount_are_drawn_and_reach_the_scan(big_circle, put):
         lidar={"noise_std": (0.01, 0.2), "mount_x": (-0.2, 0.4), "dropout": 0.0}, vehicle={"mu": (0.5, 1.0)},
     )  # fmt: skip
     put(env, [3.0, 0.0, 0.0, 0.0])
-    noise, mount = env.race.worlds.params[:, 0, [column.NOISE_STD, column.MOUNT_X]].T
+    noise, mount = (env.race.worlds.params[name][:, 0] for name in ("noise_std", "mount_x"))
     assert len(np.unique(noise)) == len(np.unique(mount)) == 12
     scans = np.stack([env.step(np.tile([0.0, -0.6], (12, 1)))[0]["scan"] for _ in range(60)])
     middle = scans[..., 250:290]

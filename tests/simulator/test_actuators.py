@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from vehiclemodels.utils.acceleration_constraints import acceleration_constraints
 from vehiclemodels.utils.steering_constraints import steering_constraints
 
-from cars import package_car, row_of, small_row
-from outlap.simulator import vehicle as column
+from cars import package_car, precise, row_of, single, small_row
 from outlap.simulator.actuators import (
     acceleration,
     delay_steps,
@@ -27,9 +26,8 @@ cars = st.sampled_from([0, 1, 2, 3])
 compiles = settings(deadline=None)
 
 
-def row_with(**actuators: float) -> np.ndarray:
-    row = parameter_bounds(VehicleParams(), ActuatorParams(**actuators))[0]
-    return row.astype(np.float64)
+def row_with(**actuators: float) -> np.void:
+    return precise(parameter_bounds(VehicleParams(), ActuatorParams(**actuators))[0])
 
 
 @compiles
@@ -55,14 +53,14 @@ def test_acceleration_limits_are_the_packages(number, fraction, push):
 @given(st.floats(-1, 1), st.floats(-0.4189, 0.4189), st.floats(0.5, 1e7), st.floats(0.001, 0.05))
 def test_steering_never_passes_its_target_nor_a_stop(target, steer, gain, dt):
     row = row_with()
-    row[column.STEER_GAIN] = gain
-    reachable = min(max(target, row[column.STEER_MIN]), row[column.STEER_MAX])
+    row["steer_gain"] = gain
+    reachable = min(max(target, row["steer_min"]), row["steer_max"])
     rate = steering_rate(target, steer, dt, row)
-    assert abs(rate) <= row[column.STEER_RATE_MAX]
+    assert abs(rate) <= row["steer_rate_max"]
     after = steer + rate * dt
     assert abs(reachable - after) <= abs(reachable - steer) + 1e-12
     assert (reachable - steer) * (reachable - after) >= -1e-12
-    assert row[column.STEER_MIN] - 1e-12 <= after <= row[column.STEER_MAX] + 1e-12
+    assert row["steer_min"] - 1e-12 <= after <= row["steer_max"] + 1e-12
 
 
 def test_bang_bang_steering_takes_the_full_rate_and_lands_on_the_target():
@@ -99,13 +97,13 @@ def test_speed_controller_has_the_gyms_four_gains(speed, target, expected):
 
 def test_a_car_that_can_neither_drive_nor_reverse_stands():
     row = row_with()
-    row[[column.V_MIN, column.V_MAX]] = 0.0
+    row["v_min"] = row["v_max"] = 0.0
     assert [acceleration(target, 0.0, row) for target in (-1.0, 0.0, 1.0)] == [0.0, 0.0, 0.0]
 
 
 def test_a_car_without_reverse_stops_smoothly():
     row = row_with()
-    row[column.V_MIN] = 0.0
+    row["v_min"] = 0.0
     speed = 3.0
     for _ in range(500):
         before = speed
@@ -120,15 +118,15 @@ def test_speed_never_leaves_its_limits(speed, target):
     row = row_with()
     for _ in range(50):
         speed += acceleration(target, speed, row) * 0.01
-        assert row[column.V_MIN] - 1e-9 <= speed <= row[column.V_MAX] + 1e-9
+        assert row["v_min"] - 1e-9 <= speed <= row["v_max"] + 1e-9
 
 
 def test_engine_power_limits_acceleration_above_the_switching_speed():
     row = row_with()
-    power = row[column.A_MAX] * row[column.V_SWITCH]
+    power = row["a_max"] * row["v_switch"]
     for speed in (8.0, 12.0, 19.0):
         assert limit_acceleration(100.0, speed, row) * speed == pytest.approx(power)
-    assert limit_acceleration(-100.0, 19.0, row) == -row[column.A_MAX]
+    assert limit_acceleration(-100.0, 19.0, row) == -row["a_max"]
 
 
 @compiles
@@ -146,11 +144,11 @@ def test_no_lag_passes_the_command():
 
 @pytest.mark.parametrize(("delay", "steps"), [(0.0, 0), (0.004, 0), (0.006, 1), (0.01, 1), (0.07, 7), (0.1, 10)])
 def test_delays_are_whole_steps(delay, steps):
-    row = parameter_bounds(VehicleParams(), ActuatorParams(steer_delay=delay, speed_delay=2 * delay))[0]
+    row = row_with(steer_delay=delay, speed_delay=2 * delay)
     assert delay_steps(row, 0.01) == (steps, round(2 * delay / 0.01))
 
 
-def test_scalar_functions_read_float32_rows_too():
-    row = small_row().astype(np.float32)
+def test_scalar_functions_read_float32_records_too():
+    row = single(small_row())
     assert steering_rate(0.3, 0.1, 0.01, row) == pytest.approx(3.2, rel=1e-6)
     assert acceleration(20.0, 5.0, row) == pytest.approx(9.51, rel=1e-6)

@@ -14,7 +14,6 @@ from outlap.simulator.collision import FREE
 from outlap.simulator.dynamics import HIGHEST_YAW_RATE
 from outlap.simulator.simulator import MODELS, Simulator, SimulatorConfig
 from outlap.simulator.state import SLIP, SPEED, STEER, YAW, YAW_RATE, X, Y
-from outlap.simulator.vehicle import A_MAX, LF, LR, MAX_RANGE, STEER_MAX, STEER_MIN, V_MAX, V_MIN
 from outlap.track.track import Track
 
 signs = st.floats(-1.0, 1.0) | st.sampled_from([-1.0, 0.0, 1.0])
@@ -27,9 +26,9 @@ def starts(draw: st.DrawFn, track: Track, row: np.ndarray) -> list[float]:
     s = draw(st.floats(0.0, 1.0)) * track.centerline.length
     side = draw(signs)
     right, left = track.centerline.widths(s)
-    speed = draw(st.floats(0.0, 1.0)) * row[V_MAX] if draw(st.booleans()) else draw(signs) * row[V_MIN]
+    speed = draw(st.floats(0.0, 1.0)) * row["v_max"] if draw(st.booleans()) else draw(signs) * row["v_min"]
     offset = 0.9 * (side * left if side > 0 else side * right)
-    return [s, float(offset), 3.0 * draw(signs), float(np.clip(speed, row[V_MIN], row[V_MAX]))]
+    return [s, float(offset), 3.0 * draw(signs), float(np.clip(speed, row["v_min"], row["v_max"]))]
 
 
 def way(track: Track, before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -60,14 +59,14 @@ def test_every_car_stays_finite_within_its_limits_and_inside_the_walls(model):
             starts=np.array([begin]),
         )  # fmt: skip
         state, scan = sim.worlds.state[0], sim.worlds.scan[0]
-        slowest, fastest = params[:, V_MIN], params[:, V_MAX]
+        slowest, fastest = params["v_min"], params["v_max"]
         if model == "drift":
             slowest, fastest = np.minimum(1.2001 * slowest, -0.2001), 1.2001 * fastest
         else:  # the controller looks once a step
-            overshoot = 1.0001 * params[:, A_MAX] * config.timestep / config.substeps
+            overshoot = 1.0001 * params["a_max"] * config.timestep / config.substeps
             slowest, fastest = slowest - overshoot, fastest + overshoot
-        lock = np.maximum(params[:, STEER_MAX], -params[:, STEER_MIN])
-        turning = np.maximum(-slowest, fastest) * np.tan(lock) / (params[:, LF] + params[:, LR]) * (1 + 1e-5)
+        lock = np.maximum(params["steer_max"], -params["steer_min"])
+        turning = np.maximum(-slowest, fastest) * np.tan(lock) / (params["lf"] + params["lr"]) * (1 + 1e-5)
         turning = np.maximum(turning, 0.0 if model == "kinematic" else HIGHEST_YAW_RATE)
         for _ in range(draw(st.integers(1, 8))):
             command = [[draw(huge), draw(huge)] for _ in range(cars)]
@@ -78,7 +77,7 @@ def test_every_car_stays_finite_within_its_limits_and_inside_the_walls(model):
                 assert np.isfinite(sim.worlds.frenet).all()
                 assert np.isfinite(sim.worlds.distance).all()
                 assert (scan >= 0.0).all()
-                assert (scan <= params[:, MAX_RANGE, None]).all()
+                assert (scan <= params["max_range"][:, None]).all()
                 np.testing.assert_array_equal(state[parked], before[parked])
                 points = way(track, before[:, [X, Y]].astype(float), state[:, [X, Y]].astype(float))
                 assert not track.is_wall(points[..., 0], points[..., 1]).any()

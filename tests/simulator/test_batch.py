@@ -12,14 +12,6 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys  # pyright: ignore
 
 from outlap.simulator.simulator import MODELS, Simulator, SimulatorConfig
-from outlap.simulator.vehicle import (
-    DROPOUT,
-    NOISE_STD,
-    SPEED_DELAY,
-    SPEED_LAG,
-    STEER_DELAY,
-    STEER_LAG,
-)
 from synthetic_tracks import CAR, assert_same, place, random_cars, random_commands, ring, snapshot
 
 
@@ -32,9 +24,10 @@ class Scene:
         self.which_track = rng.integers(0, 3, worlds)
         self.keys = rng.integers(0, 2**63, worlds, dtype=np.uint64)
         self.params = random_cars(rng, worlds, cars)
-        self.params[..., [NOISE_STD, DROPOUT]] = 0.02, 0.05
-        self.params[..., [STEER_DELAY, SPEED_DELAY]] = 0.01 * rng.integers(0, 4, (worlds, cars, 2))
-        self.params[..., [STEER_LAG, SPEED_LAG]] = rng.uniform(0.0, 0.1, (worlds, cars, 2))
+        self.params["noise_std"], self.params["dropout"] = 0.02, 0.05
+        delays, lags = 0.01 * rng.integers(0, 4, (worlds, cars, 2)), rng.uniform(0.0, 0.1, (worlds, cars, 2))
+        self.params["steer_delay"], self.params["speed_delay"] = np.moveaxis(delays, -1, 0)
+        self.params["steer_lag"], self.params["speed_lag"] = np.moveaxis(lags, -1, 0)
         self.starts = np.zeros((worlds, cars, 4))
         self.starts[..., 0] = 7.0 * np.arange(cars) + rng.uniform(0.0, 5.0, (worlds, cars))
         self.starts[..., 1] = rng.uniform(-0.5, 0.5, (worlds, cars))
@@ -129,8 +122,8 @@ def test_a_reset_of_some_worlds_leaves_the_others_alone():
 
 
 def test_the_same_reset_in_two_worlds_with_other_keys_differs_in_the_noise_only():
-    params = np.tile(CAR, (2, 1, 1))
-    params[..., NOISE_STD] = 0.05
+    params = np.full((2, 1), CAR)
+    params["noise_std"] = 0.05
     sim = place(ring(), [[[8.0, 0.0, 1.5]]] * 2, params=params, speed=2.0, beams=40)
     sim.step(np.tile([0.1, 3.0], (2, 1, 1)), 5)
     np.testing.assert_array_equal(sim.worlds.state[0], sim.worlds.state[1])

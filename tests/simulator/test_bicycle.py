@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cars import rolling, small_row
-from outlap.simulator import vehicle as column
 from outlap.simulator.bicycle import axle_loads, lateral_rate
 from outlap.simulator.dynamics import (
     EULER,
@@ -27,8 +26,8 @@ from outlap.simulator.dynamics import (
 def test_kinematic_car_drives_a_circle_of_the_radius_that_geometry_gives():
     # The rear axle's circle has radius l / tan(steer); the centre of gravity is lr in front of that axle.
     row, steer, speed = small_row(), 0.3, 2.0
-    wheelbase = row[column.LF] + row[column.LR]
-    radius = math.hypot(row[column.LR], wheelbase / math.tan(steer))
+    wheelbase = row["lf"] + row["lr"]
+    radius = math.hypot(row["lr"], wheelbase / math.tan(steer))
     steps = 200
     dt = 2 * math.pi * radius / speed / steps
     state = rolling(speed, row, steer)
@@ -50,7 +49,7 @@ def test_braking_distance_on_a_straight(model, speed):
     push = -math.copysign(5.0, speed)
     steps = 40
     dt = speed / -push / steps
-    row[column.KINEMATIC_SPEED] = kinematic_speed(row, dt)
+    row["kinematic_speed"] = kinematic_speed(row, dt)
     state = rolling(speed, row)
     for _ in range(steps):
         state = integrate(model, RK4, state, 0.0, push, dt, row)
@@ -66,9 +65,9 @@ def test_steady_cornering_follows_the_understeer_gradient():
     for _ in range(500):
         state = integrate(SINGLE_TRACK, RK4, state, 0.0, 0.0, 0.01, row)
     lateral = state[5] * speed / 9.81  # [g]
-    front = lateral / (row[column.MU] * row[column.C_SF])
-    rear = lateral / (row[column.MU] * row[column.C_SR])
-    wheelbase = row[column.LF] + row[column.LR]
+    front = lateral / (row["mu"] * row["C_Sf"])
+    rear = lateral / (row["mu"] * row["C_Sr"])
+    wheelbase = row["lf"] + row["lr"]
     assert steer == pytest.approx(wheelbase * state[5] / speed + front - rear, rel=1e-9)
 
 
@@ -77,7 +76,7 @@ def test_axle_loads_balance_weight_and_pitching_moment():
     for push in (-9.0, 0.0, 9.0):
         front, rear = axle_loads(push, row)
         assert front + rear == pytest.approx(9.81)
-        moment = front * row[column.LF] - rear * row[column.LR] + push * row[column.H]
+        moment = front * row["lf"] - rear * row["lr"] + push * row["h"]
         assert moment == pytest.approx(0.0, abs=1e-12)
     assert axle_loads(1000.0, row) == (0.0, 9.81)
     assert axle_loads(-1000.0, row) == (9.81, 0.0)
@@ -85,10 +84,10 @@ def test_axle_loads_balance_weight_and_pitching_moment():
 
 def test_wheels_roll_with_the_velocity_of_their_axle():
     row, steer, speed, yaw_rate, slip = small_row(), 0.3, 4.0, 1.5, -0.2
-    at_front = np.array([speed * math.cos(slip), speed * math.sin(slip) + row[column.LF] * yaw_rate])
+    at_front = np.array([speed * math.cos(slip), speed * math.sin(slip) + row["lf"] * yaw_rate])
     front, rear = rolling_wheel_speeds(steer, speed, yaw_rate, slip, row)
-    assert front * row[column.WHEEL_RADIUS] == pytest.approx(at_front @ [math.cos(steer), math.sin(steer)])
-    assert rear * row[column.WHEEL_RADIUS] == pytest.approx(at_front[0])
+    assert front * row["wheel_radius"] == pytest.approx(at_front @ [math.cos(steer), math.sin(steer)])
+    assert rear * row["wheel_radius"] == pytest.approx(at_front[0])
 
 
 def lateral_modes(speed, push, row):
@@ -107,13 +106,13 @@ changes = st.floats(0.6, 1.6)
 @given(changes, changes, changes, changes, changes, changes, st.floats(-3.0, 3.0), st.sampled_from([1.0, -1.0]))
 def test_lateral_rate_is_the_fastest_eigenvalue_at_low_speed(mu, front, rear, lf, mass, inertia, push, way):
     row = small_row()
-    row[column.KINEMATIC_SPEED] = 0.1
-    row[[column.MU, column.C_SF, column.C_SR, column.LF, column.M, column.I]] *= (
-        mu, front, rear, lf, mass, inertia,
-    )  # fmt: skip
+    row["kinematic_speed"] = 0.1
+    factors = {"mu": mu, "C_Sf": front, "C_Sr": rear, "lf": lf, "m": mass, "I": inertia}
+    for name, factor in factors.items():
+        row[name] *= factor
     loads = axle_loads(push, row)
-    front_stiffness = row[column.MU] * row[column.C_SF] * loads[0]
-    rear_stiffness = row[column.MU] * row[column.C_SR] * loads[1]
+    front_stiffness = row["mu"] * row["C_Sf"] * loads[0]
+    rear_stiffness = row["mu"] * row["C_Sr"] * loads[1]
     expected = lateral_rate(front_stiffness, rear_stiffness, row)
     modes = lateral_modes(way * 0.1, push, row)
     assert np.all(modes.real < 0)  # stable in both directions
@@ -126,7 +125,7 @@ def test_the_single_track_is_stable_above_its_kinematic_speed_and_not_far_below(
     row = small_row()
 
     def left_after(speed):  # of a disturbance: yaw rate [rad/s]
-        row[column.KINEMATIC_SPEED] = 0.1
+        row["kinematic_speed"] = 0.1
         state = (0.0, 0.0, 0.0, speed, 0.0, 0.0, 0.2, 0.0, 0.0)
         for _ in range(100):
             state = integrate(SINGLE_TRACK, integrator, state, 0.0, 0.0, dt, row)
@@ -136,7 +135,7 @@ def test_the_single_track_is_stable_above_its_kinematic_speed_and_not_far_below(
     assert threshold > 0.5
     assert left_after(threshold) < 1e-3
     loads = axle_loads(0.0, row)
-    rate = lateral_rate(row[column.MU] * row[column.C_SF] * loads[0], row[column.MU] * row[column.C_SR] * loads[1], row)
+    rate = lateral_rate(row["mu"] * row["C_Sf"] * loads[0], row["mu"] * row["C_Sr"] * loads[1], row)
     assert left_after(rate * dt / limit * 1.1) < 0.1
     assert left_after(rate * dt / limit * 0.9) > 10.0  # so a bound is needed
 

@@ -12,11 +12,10 @@ from outlap.simulator.atlas import build_atlas
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, rectangles_overlap, touches_wall
 from outlap.simulator.simulator import MODELS, Simulator
 from outlap.simulator.state import SLIP, SPEED, STEER, YAW, X, Y
-from outlap.simulator.vehicle import LENGTH, WIDTH
 from outlap.track.track import Track
 from synthetic_tracks import CAR, hall, place, random_map, yard
 
-CAR_LENGTH, CAR_WIDTH = float(CAR[LENGTH]), float(CAR[WIDTH])
+CAR_LENGTH, CAR_WIDTH = float(CAR["length"]), float(CAR["width"])
 CLEARANCE = 0.03  # [m] at which a car may pass a wall
 
 
@@ -191,7 +190,7 @@ def drive(sim: Simulator, seconds: float, speed) -> None:
 def body(sim: Simulator, world: int, car: int = 0) -> tuple[float, ...]:
     """Pose, length and width of a car."""
     x, y, yaw = sim.worlds.state[world, car, [X, Y, YAW]].astype(float).tolist()
-    return x, y, yaw, *sim.worlds.params[world, car, [LENGTH, WIDTH]].astype(float).tolist()
+    return x, y, yaw, *sim.worlds.params[world, car][["length", "width"]].item()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -233,7 +232,7 @@ def test_a_body_wider_than_long_stops_with_its_middle_before_the_wall():
     occupancy = np.zeros((200, 200), bool)
     occupancy[:, 150:] = True
     params = CAR.copy()
-    params[[LENGTH, WIDTH]] = 0.05, 1.0
+    params["length"], params["width"] = 0.05, 1.0
     poses = [[[6.0 + 0.007 * k, 5.0, 0.0]] for k in range(60)]
     sim = place(hall(occupancy), poses, speed=20.0, params=params, beams=0)
     drive(sim, 0.2, 20.0)

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cars import rolling, small_row
-from outlap.simulator import vehicle as column
 from outlap.simulator.bicycle import axle_loads
 from outlap.simulator.drift import drift_substeps
 from outlap.simulator.dynamics import DRIFT, EULER, RK4, SINGLE_TRACK, drift, integrate, kinematic_values
@@ -19,9 +18,7 @@ from outlap.simulator.tyre import tyre_forces
 
 def energy(state, row):
     return 0.5 * (
-        row[column.M] * state[3] ** 2
-        + row[column.I] * state[5] ** 2
-        + row[column.WHEEL_INERTIA] * (state[7] ** 2 + state[8] ** 2)
+        row["m"] * state[3] ** 2 + row["I"] * state[5] ** 2 + row["wheel_inertia"] * (state[7] ** 2 + state[8] ** 2)
     )
 
 
@@ -29,7 +26,7 @@ def energy(state, row):
 @given(st.floats(1.0, 8.0), st.floats(-3.1, 3.1), st.floats(-6.0, 6.0))
 def test_a_spinning_car_loses_energy_and_ends_rolling(speed, slip, yaw_rate):
     row = small_row()
-    wheel = max(0.0, speed * math.cos(slip)) / row[column.WHEEL_RADIUS]
+    wheel = max(0.0, speed * math.cos(slip)) / row["wheel_radius"]
     state = (0.0, 0.0, 0.0, speed, 0.0, yaw_rate, slip, wheel, wheel)
     start = lowest = energy(state, row)
     for _ in range(400):
@@ -69,7 +66,7 @@ def test_reversing_is_kinematic():
 def test_locked_wheels_slide_with_the_friction_of_full_slip():
     # Hard braking locks all wheels; from then on the deceleration is what the tyres give at slip 1.
     row = small_row()
-    row[column.A_MAX] = 20.0
+    row["a_max"] = 20.0
     state = rolling(15.0, row)
     for _ in range(60):
         state = integrate(DRIFT, RK4, state, 0.0, -20.0, 0.01, row)
@@ -77,7 +74,7 @@ def test_locked_wheels_slide_with_the_friction_of_full_slip():
     before = state[3]
     for _ in range(10):
         state = integrate(DRIFT, RK4, state, 0.0, -20.0, 0.01, row)
-    mass = row[column.M]
+    mass = row["m"]
     front, rear = (tyre_forces(1.0, 0.0, mass * load, row)[0] for load in axle_loads(-20.0, row))
     assert (state[3] - before) / 0.1 == pytest.approx((front + rear) / mass, rel=0.01)
     assert 0.5 * 9.81 < (before - state[3]) / 0.1 < 1.2 * 9.81
@@ -85,9 +82,9 @@ def test_locked_wheels_slide_with_the_friction_of_full_slip():
 
 def test_gentle_cornering_is_the_single_tracks_with_the_same_stiffness():
     row = small_row()
-    row[[column.C_SF, column.C_SR]] = -row[column.P_KY1] / row[column.MU]
+    row["C_Sf"] = row["C_Sr"] = -row["p_ky1"] / row["mu"]
     # The table's tyre pulls to one side; without its shifts it is symmetric.
-    row[[column.R_HX1, column.R_BY3, column.R_HY1, column.R_VY1, column.P_HX1]] = 0.0
+    row["r_hx1"] = row["r_by3"] = row["r_hy1"] = row["r_vy1"] = row["p_hx1"] = 0.0
     ends = []
     for model in (SINGLE_TRACK, DRIFT):
         state = rolling(4.0, row, 0.02)
@@ -112,8 +109,8 @@ def test_standing_start_reaches_the_speed_that_the_engine_gives():
     for _ in range(200):
         state = integrate(DRIFT, RK4, state, 0.0, 3.0, 0.01, row)
     # Part of the torque spins up the wheels: two axles of inertia I / r^2 beside the mass.
-    wheels = 2 * row[column.WHEEL_INERTIA] / row[column.WHEEL_RADIUS] ** 2
-    assert state[3] == pytest.approx(6.0 * row[column.M] / (row[column.M] + wheels), rel=0.02)
+    wheels = 2 * row["wheel_inertia"] / row["wheel_radius"] ** 2
+    assert state[3] == pytest.approx(6.0 * row["m"] / (row["m"] + wheels), rel=0.02)
 
 
 def test_no_tyre_drives_a_car_faster_than_its_motor():
@@ -121,11 +118,11 @@ def test_no_tyre_drives_a_car_faster_than_its_motor():
     rng = np.random.default_rng(0)
     for _ in range(60):
         row = small_row()
-        row[column.P_KX1], row[column.R_CX1], row[column.P_DY1] = 1.7, rng.uniform(-1e3, 1e3), rng.uniform(0.01, 0.6)
+        row["p_kx1"], row["r_cx1"], row["p_dy1"] = 1.7, rng.uniform(-1e3, 1e3), rng.uniform(0.01, 0.6)
         state = rolling(rng.uniform(0.5, 20.0), row)
         for _ in range(60):
             state = integrate(DRIFT, RK4, state, rng.uniform(-3.2, 3.2), rng.uniform(-9.5, 9.5), 0.01, row)
-            assert 1.2 * row[column.V_MIN] <= state[3] <= 1.2 * row[column.V_MAX]
+            assert 1.2 * row["v_min"] <= state[3] <= 1.2 * row["v_max"]
 
 
 def test_internal_steps_follow_the_stiffness():

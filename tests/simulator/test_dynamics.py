@@ -1,6 +1,6 @@
 """The models against the CommonRoad package, closed forms and conserved quantities.
 
-The scalar functions are called with float64 parameter rows here, so that derivatives can be compared to 1e-9.
+The scalar functions are called with float64 records here, so that derivatives can be compared to 1e-9.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from vehiclemodels.utils.vehicle_dynamics_ks_cog import vehicle_dynamics_ks_cog
 from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
 from vehiclemodels.vehicle_dynamics_std import vehicle_dynamics_std
 
-from cars import SMALL_CAR, package_car, rolling, row_of, small_row
-from outlap.simulator import vehicle as column
+from cars import SMALL_CAR, package_car, precise, rolling, row_of, single, small_row
 from outlap.simulator.actuators import acceleration, limit_acceleration, limit_steering_rate, steering_rate
 from outlap.simulator.bicycle import axle_loads
 from outlap.simulator.dynamics import (
@@ -37,6 +36,7 @@ from outlap.simulator.dynamics import (
     single_track,
     wrap_angle,
 )
+from outlap.simulator.vehicle import N_PARAMS
 
 compiles = settings(deadline=None)  # in the first example: how long one takes says nothing
 unit = st.floats(-1.0, 1.0, allow_subnormal=False)
@@ -53,7 +53,7 @@ def test_kinematic_derivative_is_the_packages(number, steer, speed, yaw, rate, p
     car = package_car(number)
     row = row_of(car)
     steer *= 0.4
-    speed = row[column.V_MIN] + speed * (row[column.V_MAX] - row[column.V_MIN])
+    speed = row["v_min"] + speed * (row["v_max"] - row["v_min"])
     rate = limit_steering_rate(rate * 5.0, steer, row)
     push = limit_acceleration(push * 20.0, speed, row)
     ours = kinematic((1.0, 2.0, steer, speed, yaw * math.pi, 0.0, 0.0, 0.0, 0.0), rate, push, row)
@@ -78,7 +78,7 @@ def test_kinematic_rates_are_the_derivatives_of_the_kinematic_values(steer, spee
 def test_single_track_derivative_is_the_packages(number, steer, speed, yaw, yaw_rate, slip, rate, push):
     car = package_car(number)
     row = row_of(car)
-    speed = 0.1 + speed * (row[column.V_MAX] - 0.1)
+    speed = 0.1 + speed * (row["v_max"] - 0.1)
     x = [1.0, 2.0, steer * 0.4, speed, yaw * math.pi, yaw_rate * 5, slip]
     rate = limit_steering_rate(rate * 5.0, x[2], row)
     push = limit_acceleration(push * 20.0, speed, row)
@@ -100,13 +100,13 @@ def test_single_track_is_kinematic_at_low_speed_in_both_directions(number, steer
 def test_drift_derivative_is_the_packages(number, steer, speed, yaw, yaw_rate, slip, rate, push, spin_front, spin_rear):
     car = package_car(number)
     row = row_of(car)
-    speed = 1.0 + speed * (row[column.V_MAX] - 1.0)
+    speed = 1.0 + speed * (row["v_max"] - 1.0)
     x = [1.0, 2.0, steer * 0.4, speed, yaw * math.pi, yaw_rate * 3, slip * 1.2]
-    x += [(0.001 + spin_front) * speed / row[column.WHEEL_RADIUS]]
-    x += [(0.001 + spin_rear) * speed / row[column.WHEEL_RADIUS]]
+    x += [(0.001 + spin_front) * speed / row["wheel_radius"]]
+    x += [(0.001 + spin_rear) * speed / row["wheel_radius"]]
     # Below 0.1 m/s of rolling our slip is another, for wheels that move backwards.
     front, rear = rolling_wheel_speeds(x[2], x[3], x[5], x[6], row)
-    assume(min(front, rear) * row[column.WHEEL_RADIUS] > 0.1)
+    assume(min(front, rear) * row["wheel_radius"] > 0.1)
     rate = limit_steering_rate(rate * 5.0, x[2], row)
     push = limit_acceleration(push * 9.0, speed, row)
     theirs = vehicle_dynamics_std(list(x), [rate, push], car)
@@ -122,8 +122,8 @@ def test_drift_blends_into_the_kinematic_model_as_the_package_does(number, steer
     row = row_of(car)
     x = list(rolling(speed, row, steer * 0.4))
     x[7] *= spin
-    assume(x[7] / spin * row[column.WHEEL_RADIUS] > 0.1)
-    assume(x[8] * row[column.WHEEL_RADIUS] > 0.1)
+    assume(x[7] / spin * row["wheel_radius"] > 0.1)
+    assume(x[8] * row["wheel_radius"] > 0.1)
     theirs = vehicle_dynamics_std(list(x), [0.0, push * 9.0], car)
     np.testing.assert_allclose(drift(tuple(x), 0.0, push * 9.0, row), theirs, rtol=1e-9, atol=1e-8)
 
@@ -200,17 +200,17 @@ def force_balance(x, u, row):
     _, _, steer, speed, yaw, yaw_rate, slip = x
     front_load, rear_load = axle_loads(u[1], row)
     sideways = speed * slip
-    front = row[column.MU] * row[column.C_SF] * front_load * row[column.M]
-    front *= -(sideways + row[column.LF] * yaw_rate - speed * steer) / abs(speed)
-    rear = row[column.MU] * row[column.C_SR] * rear_load * row[column.M]
-    rear *= -(sideways - row[column.LR] * yaw_rate) / abs(speed)
+    front = row["mu"] * row["C_Sf"] * front_load * row["m"]
+    front *= -(sideways + row["lf"] * yaw_rate - speed * steer) / abs(speed)
+    rear = row["mu"] * row["C_Sr"] * rear_load * row["m"]
+    rear *= -(sideways - row["lr"] * yaw_rate) / abs(speed)
     return [
         speed * math.cos(yaw + slip),
         speed * math.sin(yaw + slip),
         *u,
         yaw_rate,
-        (row[column.LF] * front - row[column.LR] * rear) / row[column.I],
-        ((front + rear) / row[column.M] - yaw_rate * speed) / speed,
+        (row["lf"] * front - row["lr"] * rear) / row["I"],
+        ((front + rear) / row["m"] - yaw_rate * speed) / speed,
     ]
 
 
@@ -244,8 +244,8 @@ def test_drift_drives_as_the_packages(manoeuvre, dt, position, angle):
 @pytest.mark.parametrize(("integrator", "order"), [(EULER, 1), (RK4, 4)])
 def test_convergence_order(model, integrator, order):
     row = small_row()
-    row[column.P_KY1], row[column.P_KX1] = -5.0, 5.0  # soft tyres: drift then takes no internal steps
-    row[column.WHEEL_INERTIA] = 0.01
+    row["p_ky1"], row["p_kx1"] = -5.0, 5.0  # soft tyres: drift then takes no internal steps
+    row["wheel_inertia"] = 0.01
     turn: Manoeuvre = [(0.32, 0.8, 1.0)]
     start = rolling(6.0, row)
     exact = drive(model, RK4, start, turn, 0.00025, row)
@@ -293,7 +293,7 @@ def test_yaw_stays_wrapped_over_many_turns():
 @njit(error_model="numpy")
 def drive_at_random(model, integrator, commands, hold, dt, row):
     """The largest magnitude of each state column over a drive; every command is held for `hold` steps."""
-    radius = row[column.WHEEL_RADIUS]
+    radius = row["wheel_radius"]
     state = (0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 2.0 / radius, 2.0 / radius)
     largest = np.zeros(9)
     for k in range(len(commands) * hold):
@@ -313,16 +313,16 @@ def test_random_cars_driven_at_random_stay_finite_and_bounded(model, integrator,
     rng = np.random.default_rng(7)
     base = small_row()
     for _ in range(40 if model != DRIFT else 10):
-        row = base * rng.uniform(0.7, 1.3, len(base))
-        row[column.MU] = rng.uniform(0.3, 1.2)
-        row[column.STEER_GAIN] = 1e6
-        row[[column.BRAKE_SPLIT, column.ENGINE_SPLIT]] = rng.uniform(0, 1, 2)
-        row[column.KINEMATIC_SPEED] = kinematic_speed(row, dt, integrator)
-        commands = rng.uniform([-0.5, row[column.V_MIN]], [0.5, row[column.V_MAX]], (50, 2))
-        largest = drive_at_random(model, integrator, commands, round(0.2 / dt), dt, row.astype(np.float32))
+        row = precise(rng.uniform(0.7, 1.3, N_PARAMS) * np.array(list(base.item())))
+        row["mu"] = rng.uniform(0.3, 1.2)
+        row["steer_gain"] = 1e6
+        row["brake_split"], row["engine_split"] = rng.uniform(0, 1, 2)
+        row["kinematic_speed"] = kinematic_speed(row, dt, integrator)
+        commands = rng.uniform([-0.5, row["v_min"]], [0.5, row["v_max"]], (50, 2))
+        largest = drive_at_random(model, integrator, commands, round(0.2 / dt), dt, single(row))
         assert np.all(np.isfinite(largest)), (row, largest)
-        steer_limit = max(-row[column.STEER_MIN], row[column.STEER_MAX])
-        speed_limit = row[column.V_MAX] + row[column.A_MAX] * dt
+        steer_limit = max(-row["steer_min"], row["steer_max"])
+        speed_limit = row["v_max"] + row["a_max"] * dt
         assert largest[2] <= steer_limit * (1 + 1e-6)
         assert largest[3] <= speed_limit
         assert np.all(largest[:2] <= 10 * speed_limit)
@@ -333,4 +333,4 @@ def test_random_cars_driven_at_random_stay_finite_and_bounded(model, integrator,
         else:
             assert largest[5] <= 50
         assert largest[6] <= math.pi / (1 if model == DRIFT else 2)
-        assert np.all(largest[7:] <= 1.2 * speed_limit / row[column.WHEEL_RADIUS])
+        assert np.all(largest[7:] <= 1.2 * speed_limit / row["wheel_radius"])

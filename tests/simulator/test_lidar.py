@@ -12,20 +12,10 @@ from scipy import stats
 from oracles import cast_rays_at_rectangle, cast_rays_at_walls, grid_to_world
 from outlap.simulator.atlas import build_atlas
 from outlap.simulator.lidar import beam_directions, cast_walls
-from outlap.simulator.vehicle import (
-    BIAS,
-    DROPOUT,
-    LENGTH,
-    MAX_RANGE,
-    MOUNT_X,
-    NOISE_STD,
-    WIDTH,
-)
 from outlap.track.catalog import load_track
 from outlap.track.track import Track
 from synthetic_tracks import CAR, hall, place, random_map, ring, yard
 
-COLUMNS = {"noise_std": NOISE_STD, "bias": BIAS, "dropout": DROPOUT, "max_range": MAX_RANGE}
 ACCURACY = 1e-3  # [m]
 # A ray that grazes a wall's corner may take it or miss it: as if walls were this much larger or smaller.
 GRAZING = 5e-3  # [cells]
@@ -201,7 +191,7 @@ def test_the_scanner_sits_in_front_of_the_centre_of_gravity_and_moves_with_the_c
     rng = np.random.default_rng(4)
     track = hall(random_map(rng, 200, 200, 0.002), 0.1, (-10.0, -10.0, 0.0))
     params = CAR.copy()
-    params[MOUNT_X] = mount_x
+    params["mount_x"] = mount_x
     poses = np.concatenate([rng.uniform(-8.0, 8.0, (6, 1, 2)), rng.uniform(-3.0, 3.0, (6, 1, 1))], axis=-1)
     sim = place(track, poses, params=params, beams=54, field_of_view=4.7)
     grazed = []
@@ -216,8 +206,8 @@ def test_the_scanner_sits_in_front_of_the_centre_of_gravity_and_moves_with_the_c
 
 
 def test_beams_that_meet_nothing_read_the_maximum_range_of_their_car():
-    params = np.tile(CAR, (1, 3, 1))
-    params[0, :, MAX_RANGE] = [2.0, 7.5, 100.0]
+    params = np.full((1, 3), CAR)
+    params["max_range"][0] = [2.0, 7.5, 100.0]
     sim = place(
         yard(),
         [[[0.0, 0.0, 0.0], [0.0, 8.0, 0.0], [0.0, -8.0, 0.0]]],
@@ -238,24 +228,24 @@ def test_cars_are_seen_where_they_are_nearer_than_the_wall_and_never_by_themselv
     poses = np.concatenate(
         [rng.uniform(-4.0, 4.0, (worlds, cars, 2)), rng.uniform(-3.0, 3.0, (worlds, cars, 1))], axis=-1
     )
-    params = np.tile(CAR, (worlds, cars, 1))
-    params[..., WIDTH] = rng.uniform(0.2, 0.8, (worlds, cars))
-    params[..., LENGTH] = rng.uniform(0.3, 1.5, (worlds, cars))
-    params[..., MOUNT_X] = rng.uniform(-0.2, 0.3, (worlds, cars))
-    params[..., MAX_RANGE] = rng.choice([3.0, 10.0], (worlds, cars))
+    params = np.full((worlds, cars), CAR)
+    params["width"] = rng.uniform(0.2, 0.8, (worlds, cars))
+    params["length"] = rng.uniform(0.3, 1.5, (worlds, cars))
+    params["mount_x"] = rng.uniform(-0.2, 0.3, (worlds, cars))
+    params["max_range"] = rng.choice([3.0, 10.0], (worlds, cars))
     sim = place(track, poses, params=params, beams=beams, field_of_view=2.0 * math.pi)
     grazed, cars_seen = [], 0
     for w in range(worlds):
         # Cars that start in contact stay where they are: every pose counts.
         bodies = [
-            (*map(float, sim.worlds.state[w, c, [0, 1, 4]]), *map(float, params[w, c, [LENGTH, WIDTH]]))
+            (*map(float, sim.worlds.state[w, c, [0, 1, 4]]), *params[w, c][["length", "width"]].item())
             for c in range(cars)
         ]
         for c in range(cars):
             x, y, yaw = bodies[c][:3]
-            x += float(params[w, c, MOUNT_X]) * math.cos(yaw)
-            y += float(params[w, c, MOUNT_X]) * math.sin(yaw)
-            angles, max_range = yaw + beam_angles(beams, 2.0 * math.pi), float(params[w, c, MAX_RANGE])
+            x += float(params["mount_x"][w, c]) * math.cos(yaw)
+            y += float(params["mount_x"][w, c]) * math.sin(yaw)
+            angles, max_range = yaw + beam_angles(beams, 2.0 * math.pi), float(params["max_range"][w, c])
             to_wall = cast_rays_at_walls(track.occupancy, track.resolution, track.origin, x, y, angles, max_range)
             to_cars = np.min([cast_rays_at_rectangle(x, y, angles, bodies[o]) for o in range(cars) if o != c], axis=0)
             cars_seen += np.count_nonzero(to_cars < to_wall)
@@ -266,8 +256,8 @@ def test_cars_are_seen_where_they_are_nearer_than_the_wall_and_never_by_themselv
 
 
 def test_a_car_is_seen_from_inside_its_body_and_at_the_end_of_the_range():
-    params = np.tile(CAR, (1, 2, 1))
-    params[0, 0, MAX_RANGE] = 3.0
+    params = np.full((1, 2), CAR)
+    params["max_range"][0, 0] = 3.0
     sim = place(yard(), [[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]], params=params, beams=9, field_of_view=6.0)
     assert not sim.worlds.scan[0, 0].any()
     rear = 3.0 - 0.01  # the other car's rear end, a centimetre within the range
@@ -297,7 +287,7 @@ def noisy(worlds=6, cars=2, beams=101, steps=40, keys=None, **errors) -> tuple[n
     clean = place(track, poses[:1], params=params, beams=beams).worlds.scan[0].copy()
     assert clean.max() < 30.0
     for name, value in errors.items():
-        params[{"noise_std": NOISE_STD, "bias": BIAS, "dropout": DROPOUT, "max_range": MAX_RANGE}[name]] = value
+        params[name] = value
     keys = np.arange(1, worlds + 1) if keys is None else keys
     sim = place(track, poses, params=params, keys=keys, beams=beams)
     scans = [sim.worlds.scan.copy()]

@@ -10,7 +10,6 @@ import pytest
 from outlap.simulator.kernels import ARC_LENGTH, HEADING_ERROR, OFFSET
 from outlap.simulator.simulator import Simulator, SimulatorConfig
 from outlap.simulator.state import STEER, YAW, X, Y
-from outlap.simulator.vehicle import A_MAX, LF, LR, SPEED_GAIN, V_SWITCH
 from synthetic_tracks import CAR, place, ring
 
 RADIUS = 8.0
@@ -27,9 +26,9 @@ def circling(starts, speed, radius=RADIUS, params=CAR, timestep=0.01) -> tuple[S
     """
     starts = np.asarray(starts, float)
     worlds = len(starts)
-    wheelbase = float(params[LF] + params[LR])
-    slip = math.asin(float(params[LR]) / radius)  # the velocity is along the circle, the body is not
-    steer = math.atan(math.tan(slip) * wheelbase / float(params[LR]))
+    wheelbase = float(params["lf"] + params["lr"])
+    slip = math.asin(float(params["lr"]) / radius)  # the velocity is along the circle, the body is not
+    steer = math.atan(math.tan(slip) * wheelbase / float(params["lr"]))
     sim = Simulator(
         [ring(RADIUS, half_width=2.0)], worlds, 1, SimulatorConfig(model="kinematic", beams=0, timestep=timestep)
     )
@@ -40,7 +39,7 @@ def circling(starts, speed, radius=RADIUS, params=CAR, timestep=0.01) -> tuple[S
     rows[:, 0, 3] = speed
     sim.reset(
         np.arange(worlds), keys=np.arange(worlds), tracks=np.zeros(worlds),
-        params=np.tile(params, (worlds, 1, 1)), starts=rows,
+        params=np.full((worlds, 1), params), starts=rows,
     )  # fmt: skip
     sim.worlds.state[..., STEER] = steer
     commands = np.empty((worlds, 1, 2))
@@ -106,14 +105,14 @@ def test_distance_laps_and_lap_times_at_constant_speed(timestep):
 
 def test_the_line_is_crossed_at_the_right_time_under_full_acceleration():
     params = CAR.copy()
-    params[SPEED_GAIN] = 1e3  # full throttle all the way to the target
+    params["speed_gain"] = 1e3  # full throttle all the way to the target
     ahead, slow = np.linspace(0.5, 2.4, 20), 1.0
     sim, commands = circling(LENGTH - ahead, slow, params=params)
     commands[..., 1] = 20.0
     for _ in range(80):
         sim.step(commands)
-    assert slow**2 + 2.0 * params[A_MAX] * ahead.max() < params[V_SWITCH] ** 2
-    a = float(params[A_MAX])
+    assert slow**2 + 2.0 * params["a_max"] * ahead.max() < params["v_switch"] ** 2
+    a = float(params["a_max"])
     exact = (-slow + np.sqrt(slow**2 + 2.0 * a * ahead)) / a
     np.testing.assert_allclose(sim.worlds.lap_start[:, 0], exact, atol=MILLISECOND)
 

@@ -12,32 +12,18 @@ from outlap.simulator.actuators import acceleration, steering_rate
 from outlap.simulator.dynamics import integrate
 from outlap.simulator.simulator import INTEGRATORS, MODELS, Simulator, SimulatorConfig
 from outlap.simulator.state import N_STATE, SPEED, STEER, WHEEL_SPEED_FRONT, WHEEL_SPEED_REAR, YAW, X, Y
-from outlap.simulator.vehicle import (
-    A_MAX,
-    KINEMATIC_SPEED,
-    MAX_RANGE,
-    SPEED_DELAY,
-    SPEED_LAG,
-    STEER_DELAY,
-    STEER_GAIN,
-    STEER_LAG,
-    STEER_MAX,
-    STEER_MIN,
-    V_MAX,
-    V_MIN,
-    WHEEL_RADIUS,
-)
+from outlap.simulator.vehicle import to_values
 from synthetic_tracks import CAR, random_cars, random_commands, ring, yard
 
 # Against a plain loop
 
 
-def drive_alone(config: SimulatorConfig, params: np.ndarray, state: np.ndarray, commands: np.ndarray) -> np.ndarray:
+def drive_alone(config: SimulatorConfig, params: np.void, state: np.ndarray, commands: np.ndarray) -> np.ndarray:
     """The state of one car after each command, kept in float32 as the simulator does: (steps, N_STATE)."""
     dt, h = config.timestep, config.timestep / config.substeps
-    steer_channel = DelayAndLag(0.0, round(float(params[STEER_DELAY]) / dt), float(params[STEER_LAG]), dt)
+    steer_channel = DelayAndLag(0.0, round(float(params["steer_delay"]) / dt), float(params["steer_lag"]), dt)
     speed_channel = DelayAndLag(
-        float(state[SPEED]), round(float(params[SPEED_DELAY]) / dt), float(params[SPEED_LAG]), dt
+        float(state[SPEED]), round(float(params["speed_delay"]) / dt), float(params["speed_lag"]), dt
     )
     states = []
     for steer, speed in np.asarray(commands, np.float32):
@@ -85,9 +71,9 @@ def compare_with_plain_loop(params: np.ndarray, tolerance: float, max_delay: flo
 )
 def test_a_step_is_that_of_a_plain_loop_bit_for_bit(model, integrator, substeps, timestep):
     params = random_cars(np.random.default_rng(1), 12, 1)
-    params[..., STEER_GAIN] = np.array([1e6, 8.0, 30.0, 2.0]).repeat(3)[:, None]
-    params[..., STEER_DELAY] = timestep * np.array([0, 1, 2, 4, 3, 0, 0.4, 0.6, 1.45, 1.55, 4, 4])[:, None]
-    params[..., SPEED_DELAY] = timestep * np.array([0, 0, 1, 3, 0, 2, 4, 4, 0.6, 0, 4, 4])[:, None]
+    params["steer_gain"] = np.array([1e6, 8.0, 30.0, 2.0]).repeat(3)[:, None]
+    params["steer_delay"] = timestep * np.array([0, 1, 2, 4, 3, 0, 0.4, 0.6, 1.45, 1.55, 4, 4])[:, None]
+    params["speed_delay"] = timestep * np.array([0, 0, 1, 3, 0, 2, 4, 4, 0.6, 0, 4, 4])[:, None]
     compare_with_plain_loop(
         params, 0.0, 4 * timestep, model=model, integrator=integrator, substeps=substeps, timestep=timestep
     )
@@ -95,17 +81,17 @@ def test_a_step_is_that_of_a_plain_loop_bit_for_bit(model, integrator, substeps,
 
 def test_lag_is_the_exact_first_order_one():
     params = random_cars(np.random.default_rng(2), 8, 1)
-    params[..., STEER_LAG] = np.array([0.0, 0.02, 0.1, 0.5, 0.0, 0.3, 0.05, 0.001])[:, None]
-    params[..., SPEED_LAG] = np.array([0.0, 0.0, 0.2, 0.1, 1.0, 0.05, 0.0, 0.001])[:, None]
-    params[..., STEER_DELAY] = 0.01 * np.array([0, 0, 0, 0, 2, 3, 1, 0])[:, None]
+    params["steer_lag"] = np.array([0.0, 0.02, 0.1, 0.5, 0.0, 0.3, 0.05, 0.001])[:, None]
+    params["speed_lag"] = np.array([0.0, 0.0, 0.2, 0.1, 1.0, 0.05, 0.0, 0.001])[:, None]
+    params["steer_delay"] = 0.01 * np.array([0, 0, 0, 0, 2, 3, 1, 0])[:, None]
     # Not bit for bit: the lag's output is kept in float32.
     compare_with_plain_loop(params, 1e-4, 0.03, model="kinematic")
 
 
 def test_a_delayed_command_arrives_after_its_delay_and_not_before():
-    params = np.tile(CAR, (3, 1, 1))
-    params[:, 0, STEER_DELAY] = 0.0, 0.05, 0.0
-    params[:, 0, SPEED_DELAY] = 0.0, 0.0, 0.08
+    params = np.full((3, 1), CAR)
+    params["steer_delay"][:, 0] = 0.0, 0.05, 0.0
+    params["speed_delay"][:, 0] = 0.0, 0.0, 0.08
     sim = Simulator([yard()], 3, 1, SimulatorConfig(beams=0), max_delay=0.08)
     starts = np.tile([0.0, 0.0, 0.0, 4.0], (3, 1, 1))
     sim.reset(np.arange(3), keys=np.arange(3), tracks=np.zeros(3), params=params, starts=starts)
@@ -140,13 +126,13 @@ def test_reset_puts_cars_where_they_are_told_rolling_straight_ahead(model):
         np.testing.assert_allclose(state[:, [X, Y]], line.to_cartesian(s, d), atol=1e-5)
         np.testing.assert_allclose(np.exp(1j * state[:, YAW]), np.exp(1j * (line.heading(s) + error)), atol=1e-5)
         np.testing.assert_array_equal(state[:, SPEED], speed.astype(np.float32))
-        rolling = speed / params[world, :, WHEEL_RADIUS]
+        rolling = speed / params["wheel_radius"][world]
         np.testing.assert_allclose(state[:, WHEEL_SPEED_FRONT], rolling, rtol=1e-6)
         np.testing.assert_allclose(state[:, WHEEL_SPEED_REAR], rolling, rtol=1e-6)
         rest = np.delete(state, [X, Y, YAW, SPEED, WHEEL_SPEED_FRONT, WHEEL_SPEED_REAR], axis=-1)
         np.testing.assert_array_equal(rest, 0.0)
     assert (np.abs(sim.worlds.state[..., YAW]) <= np.float32(math.pi)).all()
-    np.testing.assert_array_equal(sim.worlds.params[..., :KINEMATIC_SPEED], params[..., :KINEMATIC_SPEED])
+    np.testing.assert_array_equal(to_values(sim.worlds.params)[..., :-1], to_values(params)[..., :-1])
     np.testing.assert_array_equal(sim.worlds.time, 0.0)
 
 
@@ -166,7 +152,7 @@ def test_random_vehicles_under_extreme_commands_stay_finite_and_inside_the_walls
         starts = np.zeros((len(which), cars, 4))
         starts[..., 0] = rng.uniform([0.0, 10.0], [3.0, 13.0], (len(which), cars))
         starts[..., 2] = rng.uniform(-3.0, 3.0, (len(which), cars))
-        starts[..., 3] = rng.uniform(params[which, :, V_MIN], params[which, :, V_MAX])
+        starts[..., 3] = rng.uniform(params["v_min"][which], params["v_max"][which])
         sim.reset(which, keys=which, tracks=which_track[which], params=params[which], starts=starts)
 
     reset(np.arange(worlds))
@@ -183,10 +169,10 @@ def test_random_vehicles_under_extreme_commands_stay_finite_and_inside_the_walls
             in_wall = track.is_wall(here[..., X], here[..., Y])
             assert not in_wall.any(), here[in_wall]
         assert (sim.worlds.scan >= 0.0).all()
-        assert (sim.worlds.scan <= params[..., MAX_RANGE, None]).all()
-        assert (state[..., STEER] >= params[..., STEER_MIN] - 1e-5).all()
-        assert (state[..., STEER] <= params[..., STEER_MAX] + 1e-5).all()
-        assert (state[..., SPEED] <= params[..., V_MAX] + 0.01 * params[..., A_MAX]).all()
+        assert (sim.worlds.scan <= params["max_range"][..., None]).all()
+        assert (state[..., STEER] >= params["steer_min"] - 1e-5).all()
+        assert (state[..., STEER] <= params["steer_max"] + 1e-5).all()
+        assert (state[..., SPEED] <= params["v_max"] + 0.01 * params["a_max"]).all()
         fastest = max(fastest, state[..., SPEED].max())
         if step % 20 == 19 and sim.worlds.contact.any():
             crashed = np.flatnonzero(sim.worlds.contact.any(axis=1))

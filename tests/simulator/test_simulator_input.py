@@ -9,12 +9,7 @@ import pytest
 
 from outlap.errors import OutlapError
 from outlap.simulator.simulator import Simulator, SimulatorConfig
-from outlap.simulator.vehicle import (
-    LR,
-    MAX_RANGE,
-    SPEED_DELAY,
-    STEER_DELAY,
-)
+from outlap.simulator.vehicle import PARAMETERS, to_values
 from synthetic_tracks import CAR, assert_same, ring, snapshot
 
 
@@ -24,15 +19,21 @@ def good() -> dict[str, np.ndarray]:
         "which": np.arange(2),
         "keys": np.arange(2, dtype=np.uint64),
         "tracks": np.zeros(2, int),
-        "params": np.tile(CAR, (2, 2, 1)),
+        "params": np.full((2, 2), CAR),
         "starts": np.zeros((2, 2, 4)),
     }
 
 
 def changed(name: str, where, value) -> np.ndarray:
-    array = good()[name].astype(float)
+    array = good()[name]
     array[where] = value
     return array
+
+
+def with_parameter(world: int, car: int, name: str, value: float) -> np.ndarray:
+    params = good()["params"]
+    params[name][world, car] = value
+    return params
 
 
 @pytest.fixture
@@ -50,13 +51,14 @@ def sim() -> Simulator:
         ("which", [0, 2]), ("which", [-1, 0]),
         ("keys", np.arange(1, dtype=np.uint64)), ("keys", np.zeros((2, 2), np.uint64)),
         ("tracks", [0]), ("tracks", [0, 1]), ("tracks", [-1, 0]),
-        ("params", np.tile(CAR, (2, 1))), ("params", np.tile(CAR[:-1], (2, 2, 1))),
-        ("params", changed("params", (1, 0, LR), np.nan)), ("params", changed("params", (0, 1, MAX_RANGE), np.inf)),
-        ("params", changed("params", (0, 1, LR), 0.0)), ("params", np.zeros((2, 2, len(CAR)))),
-        ("params", changed("params", (0, 0, MAX_RANGE), 1e30)),
-        ("params", changed("params", (0, 0, STEER_DELAY), 0.02)),
-        ("params", changed("params", (0, 0, SPEED_DELAY), 0.01)),
-        ("params", changed("params", (0, 0, STEER_DELAY), np.nan)),
+        ("params", np.full(2, CAR)), ("params", np.full((2, 2), CAR)[["mu", "lf"]]), ("params", np.ones((2, 2))),
+        ("params", to_values(np.full((2, 2), CAR))),
+        ("params", with_parameter(1, 0, "lr", np.nan)), ("params", with_parameter(0, 1, "max_range", np.inf)),
+        ("params", with_parameter(0, 1, "lr", 0.0)), ("params", np.zeros((2, 2), PARAMETERS)),
+        ("params", with_parameter(0, 0, "max_range", 1e30)),
+        ("params", with_parameter(0, 0, "steer_delay", 0.02)),
+        ("params", with_parameter(0, 0, "speed_delay", 0.01)),
+        ("params", with_parameter(0, 0, "steer_delay", np.nan)),
         ("starts", np.zeros((2, 4))), ("starts", np.zeros((2, 2, 3))),
         ("starts", changed("starts", (0, 1, 3), np.nan)), ("starts", changed("starts", (0, 0, 0), np.inf)),
     ],

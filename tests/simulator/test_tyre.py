@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from cars import small_row
-from outlap.simulator import vehicle as column
 from outlap.simulator.tyre import tyre_forces
 
 LOAD = 18.0  # [N] an axle of the small car
@@ -14,14 +13,14 @@ LOAD = 18.0  # [N] an axle of the small car
 
 def symmetric_row():
     row = small_row()
-    row[[column.P_HX1, column.P_VX1, column.R_HX1, column.R_BY3, column.R_HY1, column.R_VY1]] = 0.0
+    row["p_hx1"] = row["p_vx1"] = row["r_hx1"] = row["r_by3"] = row["r_hy1"] = row["r_vy1"] = 0.0
     return row
 
 
 @pytest.mark.parametrize("mu", [0.4, 0.8, 1.0489])
 def test_the_lateral_peak_is_mu_times_load(mu):
     row = symmetric_row()
-    row[column.MU] = mu
+    row["mu"] = mu
     forces = [tyre_forces(0.0, angle, LOAD, row)[1] for angle in np.linspace(-1.2, 1.2, 4801)]
     assert max(forces) == pytest.approx(mu * LOAD, rel=1e-5)
     assert min(forces) == pytest.approx(-mu * LOAD, rel=1e-5)
@@ -30,12 +29,12 @@ def test_the_lateral_peak_is_mu_times_load(mu):
 @pytest.mark.parametrize("mu", [0.4, 1.0489])
 def test_friction_scales_peaks_and_leaves_slopes(mu):
     row = symmetric_row()
-    row[column.MU] = mu
+    row["mu"] = mu
     forces = [tyre_forces(slip, 0.0, LOAD, row)[0] for slip in np.linspace(-1, 1, 4001)]
-    assert max(forces) == pytest.approx(row[column.P_DX1] * mu / row[column.P_DY1] * LOAD, rel=1e-4)
+    assert max(forces) == pytest.approx(row["p_dx1"] * mu / row["p_dy1"] * LOAD, rel=1e-4)
     e = 1e-6
-    assert tyre_forces(-e, 0.0, LOAD, row)[0] == pytest.approx(row[column.P_KX1] * LOAD * e, rel=1e-4)
-    assert tyre_forces(0.0, e, LOAD, row)[1] == pytest.approx(row[column.P_KY1] * LOAD * e, rel=1e-4)
+    assert tyre_forces(-e, 0.0, LOAD, row)[0] == pytest.approx(row["p_kx1"] * LOAD * e, rel=1e-4)
+    assert tyre_forces(0.0, e, LOAD, row)[1] == pytest.approx(row["p_ky1"] * LOAD * e, rel=1e-4)
 
 
 def test_forces_oppose_slip_and_mirror():

@@ -1,4 +1,4 @@
-"""The parameter row: columns, bounds, presets, and what is refused."""
+"""The parameter record: fields, bounds, presets, and what is refused."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ from pydantic import ValidationError
 
 from outlap.config import load_config, save_config
 from outlap.errors import OutlapError
-from outlap.simulator import vehicle as column
 from outlap.simulator.vehicle import (
+    N_PARAMS,
+    NAMES,
+    PARAMETERS,
     PRESETS,
     ActuatorParams,
     LidarParams,
     PacejkaTyre,
     VehicleParams,
     parameter_bounds,
+    to_records,
+    to_values,
 )
 
 
@@ -27,10 +31,13 @@ def field_order() -> list[str]:
 
 
 def test_columns_follow_the_fields():
-    columns = {name.lower(): number for name, number in vars(column).items() if name.isupper() and name != "PRESETS"}
-    assert columns.pop("n_params") == len(field_order()) + 1
-    assert columns.pop("kinematic_speed") == len(field_order())
-    assert columns == {name.lower(): number for number, name in enumerate(field_order())}
+    assert PARAMETERS.names == (*field_order(), "kinematic_speed")
+    assert all(PARAMETERS[name] == np.float32 for name in NAMES)
+    values = np.arange(6 * N_PARAMS, dtype=np.float32).reshape(2, 3, N_PARAMS)
+    params = to_records(values)
+    for number, name in enumerate(NAMES):
+        np.testing.assert_array_equal(params[name], values[..., number])
+    np.testing.assert_array_equal(to_values(params), values)
 
 
 def test_bounds_put_every_value_in_its_own_column():
@@ -43,7 +50,7 @@ def test_bounds_put_every_value_in_its_own_column():
         return config(**{name: ranges[name] for name in config.model_fields if name in ranges}, **nested)
 
     low, high = parameter_bounds(pick(VehicleParams, tyre=pick(PacejkaTyre)), pick(ActuatorParams), pick(LidarParams))
-    assert low.shape == high.shape == (column.N_PARAMS,)
+    assert low.shape == high.shape == (N_PARAMS,)
     assert low.dtype == high.dtype == np.float32
     for number, name in enumerate(field_order()):
         np.testing.assert_allclose((low[number], high[number]), ranges[name], rtol=1e-6)

@@ -84,7 +84,7 @@ def _measure(settings: BenchmarkSimulator, cars: int, beams: int) -> dict[str, A
 
     from outlap.simulator.collision import FREE
     from outlap.simulator.simulator import Simulator, SimulatorConfig
-    from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+    from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
     from outlap.track.catalog import load_tracks
     from outlap.track.generate import BUILTIN_TRAIN
 
@@ -103,7 +103,7 @@ def _measure(settings: BenchmarkSimulator, cars: int, beams: int) -> dict[str, A
     starts = np.zeros((PLANS, worlds, cars, 4))
     starts[..., 0] = (rng.random((PLANS, worlds)) * lengths[track])[..., None] - 2.0 * np.arange(cars)
     starts[..., 3] = 3.0
-    params = np.broadcast_to(row, (worlds, cars, len(row))).astype(np.float32)
+    params = np.full((worlds, cars), to_records(row))
 
     def reset(which: np.ndarray, plan: int) -> None:
         simulator.reset(

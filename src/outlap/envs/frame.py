@@ -14,7 +14,6 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.simulator import state as column
 from outlap.simulator.collision import REMOVED
 from outlap.simulator.lidar import beam_angles
-from outlap.simulator.vehicle import LENGTH, MAX_RANGE, MOUNT_X, MU, WIDTH
 
 MOTION = (column.X, column.Y, column.YAW, column.SPEED, column.STEER, column.SLIP)  # columns of `Frame.motion`
 X, Y, YAW, SPEED, STEER, SLIP = range(len(MOTION))
@@ -77,11 +76,11 @@ def cast_of(env: RaceVectorEnv, driver: str) -> Cast:
     ]
     return Cast(
         drivers=(driver, *numbered),
-        sizes=tuple((float(length), float(width)) for length, width in params[:, [LENGTH, WIDTH]]),
+        sizes=tuple((float(length), float(width)) for length, width in params[["length", "width"]]),
         field_of_view=env.config.field_of_view,
-        max_range=float(params[EGO, MAX_RANGE]),
-        mount_x=float(params[EGO, MOUNT_X]),
-        mu=float(params[EGO, MU]),
+        max_range=float(params[EGO]["max_range"]),
+        mount_x=float(params[EGO]["mount_x"]),
+        mu=float(params[EGO]["mu"]),
     )
 
 

@@ -20,7 +20,6 @@ from outlap.envs.racing_line import LINE_SPEED, LINE_X, LINE_Y
 from outlap.simulator import state as column
 from outlap.simulator.collision import REMOVED
 from outlap.simulator.kernels import HEADING_ERROR, OFFSET
-from outlap.simulator.vehicle import STEER_MAX
 from outlap.track.centerline import CURVATURE
 
 INF = math.inf
@@ -94,7 +93,7 @@ def line_ahead(race: Race, car: int) -> np.ndarray:
 
 def action_span(race: Race, car: int) -> np.ndarray:
     """What actions mean: steering angle at full lock [rad], speeds that -1 and 1 command [m/s]."""
-    lock = race.worlds.params[:, car, STEER_MAX]
+    lock = race.worlds.params["steer_max"][:, car]
     return np.column_stack([lock, race.speeds[:, car]])
 
 

@@ -13,7 +13,6 @@ from outlap.envs.observations import OBSERVATION_TERMS, observe
 from outlap.envs.race import Race
 from outlap.errors import OutlapError
 from outlap.seeding import DRIVER_STREAM, NOISE_STREAM, uniform
-from outlap.simulator.vehicle import V_MAX
 
 LONGEST_EPISODE = 1 << 32  # steps: apart by so many, the noise of two episodes never meets
 
@@ -69,7 +68,7 @@ class Opponents:
         """Draw those of some worlds, (n,) numbers, whose keys and episodes are these.
 
         Args:
-            params: (n, cars - 1, N_PARAMS) of their cars, whose top speeds are lowered to what is drawn, and to the
+            params: PARAMETERS (n, cars - 1) of their cars, whose top speeds are lowered to what is drawn, and to the
                 driver's own.
 
         Returns:
@@ -86,9 +85,9 @@ class Opponents:
         self._begins[which] = True
         spans = self._spans[self.number[which]]
         # A trained driver gets the car that it was trained in: how hard a car accelerates goes by its top speed too.
-        params[..., V_MAX] = np.fmin(np.minimum(params[..., V_MAX], cap), spans[..., 1])
-        spans[..., 1] = np.where(np.isnan(spans[..., 1]), params[..., V_MAX], spans[..., 1])
-        self.top_speed[which] = params[..., V_MAX]
+        params["v_max"] = np.fmin(np.minimum(params["v_max"], cap), spans[..., 1])
+        spans[..., 1] = np.where(np.isnan(spans[..., 1]), params["v_max"], spans[..., 1])
+        self.top_speed[which] = params["v_max"]
         return spans
 
     def act(self) -> np.ndarray:

@@ -15,7 +15,6 @@ from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
 from outlap.simulator.collision import FREE, REMOVED
 from outlap.simulator.kernels import ARC_LENGTH
 from outlap.simulator.simulator import Simulator
-from outlap.simulator.vehicle import LENGTH
 
 EGO = 0
 
@@ -139,7 +138,7 @@ class Race:
         A car that was taken off the track keeps its place: nobody passes it any more.
         """
         lead = self.distance[:, :, None] - self.distance[:, None]
-        margin = self.worlds.params[:, None, :, LENGTH]
+        margin = self.worlds.params["length"][:, None, :]
         racing = self.worlds.contact != REMOVED
         back = racing & ~self.racing  # put back on the track: whoever went by meanwhile has overtaken nobody
         np.copyto(self.ahead, lead > 0.0, where=back[:, :, None] | back[:, None])

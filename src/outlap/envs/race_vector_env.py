@@ -28,7 +28,7 @@ from outlap.errors import OutlapError
 from outlap.seeding import world_keys
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL
 from outlap.simulator.simulator import Simulator
-from outlap.simulator.vehicle import parameter_bounds
+from outlap.simulator.vehicle import parameter_bounds, to_records, to_values
 from outlap.track.catalog import load_tracks
 from outlap.track.track import Track
 
@@ -100,7 +100,7 @@ class RaceVectorEnv(VectorEnv):
 
         self.tasks = TaskSet(loaded, self.config.vehicle, self.config.actuators, self.config.lidar)
         simulator = Simulator(loaded, num_envs, self.config.num_cars, self.config, self.tasks.max_delay)
-        typical = np.mean(parameter_bounds(self.config.vehicle), axis=0)
+        typical = to_records(np.mean(parameter_bounds(self.config.vehicle), axis=0))
         drivers = self._find_opponents(self.config.opponents if rivals is None else rivals)
         looked_at = any(
             "line_ahead" in terms
@@ -368,7 +368,7 @@ class RaceVectorEnv(VectorEnv):
             "outcome": np.full(self.num_envs, RUNNING) if outcome is None else outcome,
             "track": self._names[worlds.track],
             "task": self._task.copy(),
-            "vehicle": worlds.params.copy(),
+            "vehicle": to_values(worlds.params).copy(),
             "contact": CONTACTS[worlds.contact[:, EGO]],
             "opponents": np.full(nobody.shape, "", object) if opponents is None else opponents.names(),
             "opponent_speed_mps": nobody if opponents is None else opponents.top_speed.copy(),

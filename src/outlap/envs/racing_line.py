@@ -11,7 +11,6 @@ from outlap.planning.limits import Limits
 from outlap.planning.path import Path
 from outlap.planning.speed_profile import speed_profile, speed_profiles
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
-from outlap.simulator.vehicle import A_MAX, MU, V_MAX, V_SWITCH
 from outlap.track import centerline
 from outlap.track.centerline import CURVATURE
 from outlap.track.track import Track
@@ -30,12 +29,12 @@ def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, ch
     Points of a line are at the arc lengths of the centreline beside which they lie.
 
     Args:
-        params: (N_PARAMS,) of a typical car, for which lines are planned.
+        params: a record of PARAMETERS, a typical car, for which lines are planned.
         choice: which line.
 
     Raises OutlapError for a track on which none can be planned.
     """
-    limits = Limits.of_row(params)
+    limits = Limits.of_record(params)
     out = np.empty((len(atlas.line), 3), np.float32)
     for number, track in enumerate(tracks):
         first, rows = atlas.index[number, FIRST_ROW], atlas.index[number, ROWS]
@@ -64,12 +63,12 @@ class ReferenceSpeeds:
 
         Args:
             tracks, atlas: see `racing_lines`.
-            params: (N_PARAMS,) of a typical car.
+            params: a record of PARAMETERS, a typical car.
             worlds, cars: how many there are.
 
         Raises OutlapError for a track on which none can be planned.
         """
-        limits = Limits.of_row(params)
+        limits = Limits.of_record(params)
         self._lines = [kept_line(track, limits).path.resampled(PROFILE_SPACING) for track in tracks]
         rows = atlas.index[:, ROWS]
         self._beside = [
@@ -80,13 +79,13 @@ class ReferenceSpeeds:
         self._speed = np.zeros((worlds, cars, int(rows.max())), np.float32)
 
     def begin(self, which: np.ndarray, track: np.ndarray, params: np.ndarray) -> None:
-        """Take note of worlds (n,) that begin an episode, on tracks (n,), with cars (n, cars, N_PARAMS)."""
+        """Take note of worlds (n,) that begin an episode, on tracks (n,), with cars PARAMETERS (n, cars)."""
         cars = params.shape[1]
-        motors = params[..., [A_MAX, A_MAX, V_MAX, V_SWITCH]]
+        motors = np.stack([params[name] for name in ("a_max", "a_max", "v_max", "v_switch")], axis=-1)
         for number in np.unique(track):
             here = np.flatnonzero(track == number)
             line, beside = self._lines[number], self._beside[number]
-            mu = params[here][..., MU].reshape(-1, 1)
+            mu = params["mu"][here].reshape(-1, 1)
             speeds = speed_profiles(line.curvature, line.spacing, motors[here].reshape(-1, 4), mu)
             self._speed[which[here], :, : len(beside)] = speeds[:, beside].reshape(len(here), cars, -1)
 

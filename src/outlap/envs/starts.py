@@ -11,7 +11,6 @@ from outlap.config import Config, Number, bounded, bounds
 from outlap.envs.race import EGO
 from outlap.seeding import START_STREAM, uniform
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
-from outlap.simulator.vehicle import LENGTH, V_MAX, V_MIN, WIDTH
 from outlap.track.centerline import WIDTH_LEFT, WIDTH_RIGHT
 
 MARGIN = 0.1  # [m] that a start leaves at least between the car and the track's edge, or the next car
@@ -50,7 +49,7 @@ def draw_starts(
         keys: uint64 (n,) of the worlds.
         draws: (n,) numbers that differ from draw to draw.
         tracks: (n,) numbers in the atlas.
-        params: (n, cars, N_PARAMS).
+        params: PARAMETERS (n, cars).
         spread: 0 … 1 of the configured offsets and heading errors.
 
     Returns:
@@ -62,14 +61,14 @@ def draw_starts(
     rows, spacing = atlas.index[tracks, ROWS, None], atlas.frame[tracks, SPACING, None]
     length = rows * spacing
     if config.formation == "scattered":
-        behind = _scattered(each[..., GAP], params[..., LENGTH] + max(bounds(config.gap)[0], MARGIN), length)
+        behind = _scattered(each[..., GAP], params["length"] + max(bounds(config.gap)[0], MARGIN), length)
     else:
-        behind = _queued(config, each, params[..., LENGTH])
+        behind = _queued(config, each, params["length"])
     base = share[:, :1] * length if config.anywhere else np.zeros((len(keys), 1))
     s = base - behind
     row = atlas.index[tracks, FIRST_ROW, None] + (s / spacing).astype(np.int64) % rows
     # The body's half diagonal stays on the track whichever way the car points.
-    body = 0.5 * np.hypot(params[..., LENGTH], params[..., WIDTH]) + MARGIN
+    body = 0.5 * np.hypot(params["length"], params["width"]) + MARGIN
     side = 2.0 * each[..., SIDE] - 1.0
     if config.formation == "grid":
         side = 1.0 - 2.0 * (_places(behind) % 2)
@@ -77,7 +76,7 @@ def draw_starts(
     offset = side * np.maximum(room, 0.0) * config.offset * spread
     error = (2.0 * each[..., HEADING] - 1.0) * config.heading_error * spread
     low, high = bounds(config.speed)
-    speed = np.clip(low + each[..., SPEED] * (high - low), params[..., V_MIN], params[..., V_MAX])
+    speed = np.clip(low + each[..., SPEED] * (high - low), params["v_min"], params["v_max"])
     return np.stack([s, offset, error, speed], axis=-1)
 
 

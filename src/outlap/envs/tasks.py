@@ -12,12 +12,11 @@ from outlap.errors import OutlapError
 from outlap.seeding import PARAMETER_STREAM, TRACK_STREAM, uniform
 from outlap.simulator.vehicle import (
     N_PARAMS,
-    SPEED_DELAY,
-    STEER_DELAY,
     ActuatorParams,
     LidarParams,
     VehicleParams,
     parameter_bounds,
+    to_records,
 )
 from outlap.track.track import Track
 
@@ -38,8 +37,8 @@ class TaskSet:
     @property
     def max_delay(self) -> float:
         """The longest actuator delay that a task can have [s]."""
-        _, high = self._bounds
-        return float(max(high[STEER_DELAY], high[SPEED_DELAY]))
+        high = to_records(self._bounds[1])
+        return float(max(high["steer_delay"], high["speed_delay"]))
 
     @cached_property
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -55,14 +54,14 @@ class TaskSet:
 
         Returns:
             tracks: int64 (n,) positions in `tracks`.
-            params: float32 (n, num_cars, N_PARAMS).
+            params: PARAMETERS (n, num_cars).
         """
         choice = uniform(keys, episodes, TRACK_STREAM, 1)[:, 0]
         low, high = self._bounds
         share = uniform(keys, episodes, PARAMETER_STREAM, num_cars * N_PARAMS)
         share = share.reshape(len(keys), num_cars, N_PARAMS)
-        params = (low + share * (high - low)).astype(np.float32)
-        return (choice * len(self.tracks)).astype(np.int64), np.clip(params, low, high)
+        values = (low + share * (high - low)).astype(np.float32)
+        return (choice * len(self.tracks)).astype(np.int64), to_records(np.clip(values, low, high))
 
 
 @dataclass(frozen=True, eq=False)

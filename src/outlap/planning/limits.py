@@ -8,9 +8,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from outlap.errors import OutlapError
-from outlap.simulator import vehicle
 from outlap.simulator.bicycle import GRAVITY
-from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+from outlap.simulator.vehicle import NAMES, VehicleParams, parameter_bounds, to_records
 from outlap.track.raceline import Raceline
 
 LEAST = 0.01  # of what a line that never turns, or never changes its speed, asks for
@@ -47,22 +46,22 @@ class Limits:
         return self.mu * GRAVITY
 
     @classmethod
-    def of_row(cls, row: np.ndarray) -> Limits:
-        """Of a car's parameter row (N_PARAMS,)."""
-        p = np.asarray(row, np.float64)
-        wheelbase = p[vehicle.LF] + p[vehicle.LR]
-        lock = min(p[vehicle.STEER_MAX], -p[vehicle.STEER_MIN])
+    def of_record(cls, record: np.ndarray) -> Limits:
+        """Return the limits of a car, a record of `simulator.vehicle.PARAMETERS`."""
+        p = {name: float(record[name]) for name in NAMES}
+        wheelbase = p["lf"] + p["lr"]
+        lock = min(p["steer_max"], -p["steer_min"])
         values = {
-            "mu": p[vehicle.MU],
-            "a_max": p[vehicle.A_MAX],
-            "a_brake": p[vehicle.A_MAX],
-            "v_max": p[vehicle.V_MAX],
-            "v_switch": p[vehicle.V_SWITCH],
+            "mu": p["mu"],
+            "a_max": p["a_max"],
+            "a_brake": p["a_max"],
+            "v_max": p["v_max"],
+            "v_switch": p["v_switch"],
             "max_curvature": math.tan(lock) / wheelbase,
-            "steer_rate_max": p[vehicle.STEER_RATE_MAX],
+            "steer_rate_max": p["steer_rate_max"],
             "wheelbase": wheelbase,
-            "length": p[vehicle.LENGTH],
-            "width": p[vehicle.WIDTH],
+            "length": p["length"],
+            "width": p["width"],
         }
         return cls(**{name: float(f"{value:.6g}") for name, value in values.items()})
 
@@ -80,4 +79,4 @@ class Limits:
     @classmethod
     def of(cls, params: VehicleParams) -> Limits:
         """Of a car; of the middle of every range."""
-        return cls.of_row(np.mean(parameter_bounds(params), axis=0))
+        return cls.of_record(to_records(np.mean(parameter_bounds(params), axis=0)))

@@ -15,7 +15,7 @@ from outlap.planning.limits import Limits
 from outlap.planning.path import Path
 from outlap.planning.plan import DEFAULT_MARGIN, SPACING, plan_line
 from outlap.planning.speed_profile import lap_time, motor, speed_profiles
-from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
 from outlap.track.track import Track
 
 DRAWN = ("mu", "a_max", "v_max", "v_switch")  # what counts where it is drawn; of the rest, the middle does
@@ -54,7 +54,7 @@ def min_laps(track: Track, vehicle: VehicleParams) -> MinLaps:
 
     Raises OutlapError where no line can be planned for the middle of the ranges.
     """
-    low, high = map(Limits.of_row, parameter_bounds(vehicle))
+    low, high = (Limits.of_record(to_records(values)) for values in parameter_bounds(vehicle))
     middle = Limits.of(vehicle)
 
     def to_arrays(table: MinLaps) -> dict[str, np.ndarray]:

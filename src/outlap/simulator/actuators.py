@@ -9,27 +9,13 @@ import math
 
 from numba import njit
 
-from outlap.simulator.vehicle import (
-    A_MAX,
-    SPEED_DELAY,
-    SPEED_GAIN,
-    STEER_DELAY,
-    STEER_GAIN,
-    STEER_MAX,
-    STEER_MIN,
-    STEER_RATE_MAX,
-    V_MAX,
-    V_MIN,
-    V_SWITCH,
-)
-
 
 @njit(cache=True, error_model="numpy")
 def limit_steering_rate(rate, steer, p):
     """A steering rate [rad/s] within the motor's limit, and none outwards at a stop."""
-    if (steer <= p[STEER_MIN] and rate <= 0.0) or (steer >= p[STEER_MAX] and rate >= 0.0):
+    if (steer <= p.steer_min and rate <= 0.0) or (steer >= p.steer_max and rate >= 0.0):
         return 0.0
-    return min(max(1.0 * rate, -p[STEER_RATE_MAX]), 1.0 * p[STEER_RATE_MAX])
+    return min(max(1.0 * rate, -p.steer_rate_max), 1.0 * p.steer_rate_max)
 
 
 @njit(cache=True, error_model="numpy")
@@ -38,12 +24,12 @@ def limit_acceleration(acceleration, speed, p):
 
     Source: Althoff and Würsching, CommonRoad: Vehicle Models, 2020, section 4, equation (3).
     """
-    if (speed <= p[V_MIN] and acceleration <= 0.0) or (speed >= p[V_MAX] and acceleration >= 0.0):
+    if (speed <= p.v_min and acceleration <= 0.0) or (speed >= p.v_max and acceleration >= 0.0):
         return 0.0
-    largest = 1.0 * p[A_MAX]
+    largest = 1.0 * p.a_max
     forward = largest
-    if speed > p[V_SWITCH]:  # constant power
-        forward = largest * p[V_SWITCH] / speed
+    if speed > p.v_switch:  # constant power
+        forward = largest * p.v_switch / speed
     return min(max(1.0 * acceleration, -largest), forward)
 
 
@@ -59,8 +45,8 @@ def steering_rate(target, steer, dt, p):
         steer: present angle [rad].
         dt: physics step [s].
     """
-    error = min(max(1.0 * target, 1.0 * p[STEER_MIN]), 1.0 * p[STEER_MAX]) - steer
-    return limit_steering_rate(min(1.0 * p[STEER_GAIN], 1.0 / dt) * error, steer, p)
+    error = min(max(1.0 * target, 1.0 * p.steer_min), 1.0 * p.steer_max) - steer
+    return limit_steering_rate(min(1.0 * p.steer_gain, 1.0 / dt) * error, steer, p)
 
 
 @njit(cache=True, error_model="numpy")
@@ -74,13 +60,13 @@ def acceleration(target_speed, speed, p):
     error = target_speed - speed
     if error == 0.0:  # a car that can neither drive nor reverse has no gain
         return 0.0
-    gain = 1.0 * p[SPEED_GAIN]
+    gain = 1.0 * p.speed_gain
     if speed <= 0.0:
         gain *= 0.2
-    scale = 1.0 * p[V_MAX]
+    scale = 1.0 * p.v_max
     if error <= 0.0:
-        scale = max(-1.0 * p[V_MIN], 0.1 * scale)
-    return limit_acceleration(gain * p[A_MAX] / scale * error, speed, p)
+        scale = max(-1.0 * p.v_min, 0.1 * scale)
+    return limit_acceleration(gain * p.a_max / scale * error, speed, p)
 
 
 @njit(cache=True, error_model="numpy")
@@ -101,4 +87,4 @@ def lag(value, command, dt, time_constant):
 @njit(cache=True, error_model="numpy")
 def delay_steps(p, dt):
     """The physics steps by which the (steering, speed) commands come late: the nearest whole numbers."""
-    return int(p[STEER_DELAY] / dt + 0.5), int(p[SPEED_DELAY] / dt + 0.5)
+    return int(p.steer_delay / dt + 0.5), int(p.speed_delay / dt + 0.5)

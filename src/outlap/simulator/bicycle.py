@@ -16,20 +16,6 @@ import math
 
 from numba import njit
 
-from outlap.simulator.vehicle import (
-    A_MAX,
-    C_SF,
-    C_SR,
-    KINEMATIC_SPEED,
-    LF,
-    LR,
-    MU,
-    WHEEL_RADIUS,
-    H,
-    I,
-    M,
-)
-
 EULER, RK4 = 0, 1
 
 GRAVITY = 9.81  # [m/s^2]
@@ -40,15 +26,15 @@ LOWEST_KINEMATIC_SPEED = 0.1  # [m/s] the single-track divides by speed; the pub
 def kinematic(state, steer_rate, acceleration, p):
     """Time derivative of a state under the kinematic model; wheel speeds have none."""
     _, _, steer, speed, yaw, _, _, _, _ = state
-    wheelbase = 1.0 * p[LF] + p[LR]
+    wheelbase = 1.0 * p.lf + p.lr
     tan_steer = math.tan(steer)
-    tan_slip = tan_steer * p[LR] / wheelbase
+    tan_slip = tan_steer * p.lr / wheelbase
     cos_slip = 1.0 / math.sqrt(1.0 + tan_slip * tan_slip)
     sin_slip = tan_slip * cos_slip
     cos_yaw = math.cos(yaw)
     sin_yaw = math.sin(yaw)
     tan_rate = steer_rate * (1.0 + tan_steer * tan_steer)  # d tan(steer) / dt
-    slip_rate = tan_rate * p[LR] / wheelbase * cos_slip * cos_slip
+    slip_rate = tan_rate * p.lr / wheelbase * cos_slip * cos_slip
     yaw_acceleration = (
         acceleration * cos_slip * tan_steer - speed * sin_slip * slip_rate * tan_steer + speed * cos_slip * tan_rate
     ) / wheelbase
@@ -75,8 +61,8 @@ def single_track(state, steer_rate, acceleration, p):
     direction = 1.0 if speed > 0.0 else -1.0
     inverse_speed = 1.0 / speed
     # Lateral forces divided by mass [m/s^2].
-    front = direction * p[MU] * p[C_SF] * front_load * (steer - slip - p[LF] * yaw_rate * inverse_speed)
-    rear = direction * p[MU] * p[C_SR] * rear_load * (p[LR] * yaw_rate * inverse_speed - slip)
+    front = direction * p.mu * p.C_Sf * front_load * (steer - slip - p.lf * yaw_rate * inverse_speed)
+    rear = direction * p.mu * p.C_Sr * rear_load * (p.lr * yaw_rate * inverse_speed - slip)
     course = slip + yaw
     return (
         speed * math.cos(course),
@@ -84,7 +70,7 @@ def single_track(state, steer_rate, acceleration, p):
         steer_rate,
         acceleration,
         yaw_rate,
-        (p[LF] * front - p[LR] * rear) * (p[M] / p[I]),
+        (p.lf * front - p.lr * rear) * (p.m / p.I),
         (front + rear) * inverse_speed - yaw_rate,
         0.0,
         0.0,
@@ -94,7 +80,7 @@ def single_track(state, steer_rate, acceleration, p):
 @njit(cache=True, error_model="numpy")
 def is_kinematic(speed, p):
     """Whether the single-track model is kinematic at this speed [m/s], forwards or in reverse."""
-    return abs(speed) < max(1.0 * p[KINEMATIC_SPEED], LOWEST_KINEMATIC_SPEED)
+    return abs(speed) < max(1.0 * p.kinematic_speed, LOWEST_KINEMATIC_SPEED)
 
 
 @njit(cache=True, error_model="numpy")
@@ -112,8 +98,8 @@ def kinematic_speed(p, dt, integrator=RK4):
     fastest = 0.0
     # The rate is convex in the axle loads: its largest value is at one end of the load transfer.
     for sign in (-1.0, 1.0):
-        front_load, rear_load = axle_loads(sign * p[A_MAX], p)
-        rate = lateral_rate(p[MU] * p[C_SF] * front_load, p[MU] * p[C_SR] * rear_load, p)
+        front_load, rear_load = axle_loads(sign * p.a_max, p)
+        rate = lateral_rate(p.mu * p.C_Sf * front_load, p.mu * p.C_Sr * rear_load, p)
         fastest = max(fastest, rate)
     return max(0.5, fastest * dt / stability_bound(integrator))
 
@@ -121,9 +107,9 @@ def kinematic_speed(p, dt, integrator=RK4):
 @njit(cache=True, error_model="numpy")
 def kinematic_values(steer, speed, p):
     """(yaw rate [rad/s], slip angle [rad]) of a car whose wheels do not slip."""
-    wheelbase = 1.0 * p[LF] + p[LR]
+    wheelbase = 1.0 * p.lf + p.lr
     tan_steer = math.tan(steer)
-    tan_slip = tan_steer * p[LR] / wheelbase
+    tan_slip = tan_steer * p.lr / wheelbase
     return speed * tan_steer / (wheelbase * math.sqrt(1.0 + tan_slip * tan_slip)), math.atan(tan_slip)
 
 
@@ -131,16 +117,16 @@ def kinematic_values(steer, speed, p):
 def rolling_wheel_speeds(steer, speed, yaw_rate, slip, p):
     """(front, rear) wheel speeds [rad/s] at which the wheels roll without longitudinal slip."""
     forward = speed * math.cos(slip)
-    leftward = speed * math.sin(slip) + yaw_rate * p[LF]
+    leftward = speed * math.sin(slip) + yaw_rate * p.lf
     front = forward * math.cos(steer) + leftward * math.sin(steer)
-    return front / p[WHEEL_RADIUS], forward / p[WHEEL_RADIUS]
+    return front / p.wheel_radius, forward / p.wheel_radius
 
 
 @njit(cache=True, error_model="numpy")
 def axle_loads(acceleration, p):
     """Vertical forces on the (front, rear) axle divided by mass [m/s^2], under load transfer."""
-    wheelbase = 1.0 * p[LF] + p[LR]
-    front = (GRAVITY * p[LR] - acceleration * p[H]) / wheelbase
+    wheelbase = 1.0 * p.lf + p.lr
+    front = (GRAVITY * p.lr - acceleration * p.h) / wheelbase
     front = min(max(front, 0.0), GRAVITY)
     return front, GRAVITY - front
 
@@ -156,10 +142,10 @@ def lateral_rate(front_stiffness, rear_stiffness, p):
     Returns:
         [m/s^2]; divided by speed, the rate [1/s] at which the fastest lateral mode decays.
     """
-    ratio = 1.0 * p[M] / p[I]
+    ratio = 1.0 * p.m / p.I
     slip_damping = front_stiffness + rear_stiffness
-    yaw_damping = ratio * (p[LF] * p[LF] * front_stiffness + p[LR] * p[LR] * rear_stiffness)
-    coupling = p[LR] * rear_stiffness - p[LF] * front_stiffness
+    yaw_damping = ratio * (p.lf * p.lf * front_stiffness + p.lr * p.lr * rear_stiffness)
+    coupling = p.lr * rear_stiffness - p.lf * front_stiffness
     return 0.5 * (
         slip_damping + yaw_damping + math.sqrt((slip_damping - yaw_damping) ** 2 + 4.0 * ratio * coupling * coupling)
     )

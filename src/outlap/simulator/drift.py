@@ -20,18 +20,6 @@ from outlap.simulator.bicycle import (
     stability_bound,
 )
 from outlap.simulator.tyre import tyre_forces
-from outlap.simulator.vehicle import (
-    BRAKE_SPLIT,
-    ENGINE_SPLIT,
-    LF,
-    LR,
-    P_KX1,
-    P_KY1,
-    WHEEL_INERTIA,
-    WHEEL_RADIUS,
-    I,
-    M,
-)
 
 BLEND_SPEED = 0.2  # [m/s] where the model is half kinematic
 BLEND_WIDTH = 0.05  # [m/s]
@@ -46,18 +34,18 @@ def drift(state, steer_rate, acceleration, p):
     _, _, steer, speed, yaw, yaw_rate, slip, wheel_front, wheel_rear = state
     wheel_front = max(wheel_front, 0.0)  # wheels never spin backwards
     wheel_rear = max(wheel_rear, 0.0)
-    radius = 1.0 * p[WHEEL_RADIUS]
-    mass = 1.0 * p[M]
+    radius = 1.0 * p.wheel_radius
+    mass = 1.0 * p.m
 
     # Velocities of the axles in the frames of their wheels.
     forward = speed * math.cos(slip)
     leftward = speed * math.sin(slip)
-    front_leftward = leftward + yaw_rate * p[LF]
+    front_leftward = leftward + yaw_rate * p.lf
     cos_steer = math.cos(steer)
     sin_steer = math.sin(steer)
     front_rolling = forward * cos_steer + front_leftward * sin_steer
     front_sliding = front_leftward * cos_steer - forward * sin_steer
-    rear_sliding = leftward - yaw_rate * p[LR]
+    rear_sliding = leftward - yaw_rate * p.lr
 
     front_angle = 0.0
     rear_angle = 0.0
@@ -78,15 +66,15 @@ def drift(state, steer_rate, acceleration, p):
     cos_slip = math.cos(slip)
     sin_slip = math.sin(slip)
     speed_rate = (force_x * cos_slip + force_y * sin_slip) / mass
-    yaw_acceleration = (p[LF] * front_y_car - p[LR] * rear_y) / p[I]
+    yaw_acceleration = (p.lf * front_y_car - p.lr * rear_y) / p.I
     slip_rate = 0.0
     if speed > SLOWEST_ROLLING:
         slip_rate = (force_y * cos_slip - force_x * sin_slip) / (mass * speed) - yaw_rate
 
     torque = mass * radius * acceleration
-    front_share = 1.0 * p[ENGINE_SPLIT] if acceleration > 0.0 else 1.0 * p[BRAKE_SPLIT]
-    front_spin = (front_share * torque - radius * front_x) / p[WHEEL_INERTIA]
-    rear_spin = ((1.0 - front_share) * torque - radius * rear_x) / p[WHEEL_INERTIA]
+    front_share = 1.0 * p.engine_split if acceleration > 0.0 else 1.0 * p.brake_split
+    front_spin = (front_share * torque - radius * front_x) / p.wheel_inertia
+    rear_spin = ((1.0 - front_share) * torque - radius * rear_x) / p.wheel_inertia
     if wheel_front <= 0.0:
         front_spin = max(front_spin, 0.0)
     if wheel_rear <= 0.0:
@@ -121,13 +109,13 @@ def drift_substeps(integrator, state, acceleration, dt, p):
     if speed <= SLOWEST_ROLLING:
         return 1
     front_load, rear_load = axle_loads(acceleration, p)
-    radius = 1.0 * p[WHEEL_RADIUS]
+    radius = 1.0 * p.wheel_radius
     front_wheel, rear_wheel = rolling_wheel_speeds(steer, speed, yaw_rate, slip, p)
-    stiffness = radius * radius * p[P_KX1] * p[M] / p[WHEEL_INERTIA]
+    stiffness = radius * radius * p.p_kx1 * p.m / p.wheel_inertia
     rate = max(
         stiffness * front_load / max(abs(front_wheel * radius), SLOWEST_ROLLING),
         stiffness * rear_load / max(abs(rear_wheel * radius), SLOWEST_ROLLING),
     )
-    rate = max(rate, lateral_rate(-p[P_KY1] * front_load, -p[P_KY1] * rear_load, p) / speed)
+    rate = max(rate, lateral_rate(-p.p_ky1 * front_load, -p.p_ky1 * rear_load, p) / speed)
     needed = math.ceil(drift_weight(speed) * rate * dt / stability_bound(integrator))
     return int(min(max(needed, 1.0), 1.0 * MAX_SUBSTEPS))

@@ -27,7 +27,6 @@ from outlap.simulator.bicycle import (
     wrap_angle,
 )
 from outlap.simulator.drift import BLEND_SPEED, RELAXATION_TIME, drift, drift_substeps, drift_weight
-from outlap.simulator.vehicle import V_MAX, V_MIN, WHEEL_RADIUS
 
 __all__ = [
     "DRIFT",
@@ -89,7 +88,7 @@ def integrate(model, integrator, state, steer_rate, acceleration, dt, p):
         # as far as the model can mean anything.
         slip = min(max(slip, -0.5 * math.pi), 0.5 * math.pi)
         yaw_rate = min(max(yaw_rate, -HIGHEST_YAW_RATE), HIGHEST_YAW_RATE)
-    wheel_speed = speed / p[WHEEL_RADIUS]
+    wheel_speed = speed / p.wheel_radius
     return x, y, steer, speed, wrap_angle(yaw), yaw_rate, slip, wheel_speed, wheel_speed
 
 
@@ -98,9 +97,9 @@ def _substepped_drift(integrator, state, steer_rate, acceleration, dt, p):
     """A drift step, cut into as many equal ones as its stiff wheels and tyres need at this speed."""
     count = drift_substeps(integrator, state, acceleration, dt, p)
     h = dt / count
-    fastest = HIGHEST_WHEEL_SPEED * p[V_MAX]
-    fastest_back = min(HIGHEST_WHEEL_SPEED * p[V_MIN], -BLEND_SPEED)  # below which a spin ends in reverse
-    fastest_wheel = fastest / p[WHEEL_RADIUS]
+    fastest = HIGHEST_WHEEL_SPEED * p.v_max
+    fastest_back = min(HIGHEST_WHEEL_SPEED * p.v_min, -BLEND_SPEED)  # below which a spin ends in reverse
+    fastest_wheel = fastest / p.wheel_radius
     x, y, steer, speed, yaw, yaw_rate, slip, front, rear = state
     for _ in range(count):
         x, y, steer, speed, yaw, yaw_rate, slip, front, rear = _drift_step(

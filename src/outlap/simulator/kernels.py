@@ -26,15 +26,6 @@ from outlap.simulator.dynamics import (
     wrap_angle,
 )
 from outlap.simulator.lidar import cast_car, cast_walls, spoil
-from outlap.simulator.vehicle import (
-    KINEMATIC_SPEED,
-    LENGTH,
-    MAX_RANGE,
-    MOUNT_X,
-    SPEED_LAG,
-    STEER_LAG,
-    WIDTH,
-)
 from outlap.track.centerline import frenet_point, frenet_project
 
 # Columns of Worlds.frenet
@@ -59,7 +50,7 @@ class Worlds(NamedTuple):
     track: np.ndarray  # int32 (worlds,) number in the atlas
     time: np.ndarray  # float64 (worlds,) since the reset [s]
     tick: np.ndarray  # int64 (worlds,) physics steps since the reset
-    params: np.ndarray  # float32 (worlds, cars, N_PARAMS)
+    params: np.ndarray  # PARAMETERS (worlds, cars)
     state: np.ndarray  # float32 (worlds, cars, N_STATE)
     before: np.ndarray  # float32 (worlds, cars, 3): x, y, yaw one physics step ago
     delayed: np.ndarray  # float32 (worlds, cars, slots, 2): ring of the latest commands
@@ -89,8 +80,8 @@ def _drive(constants, worlds, w, c, steer_command, speed_command):
     steer_late, speed_late = delay_steps(p, dt)
     steer_target = worlds.delayed[w, c, (slot - min(steer_late, slots - 1)) % slots, 0]
     speed_target = worlds.delayed[w, c, (slot - min(speed_late, slots - 1)) % slots, 1]
-    steer_target = lag(worlds.lagged[w, c, 0], steer_target, dt, p[STEER_LAG])
-    speed_target = lag(worlds.lagged[w, c, 1], speed_target, dt, p[SPEED_LAG])
+    steer_target = lag(worlds.lagged[w, c, 0], steer_target, dt, p.steer_lag)
+    speed_target = lag(worlds.lagged[w, c, 1], speed_target, dt, p.speed_lag)
     worlds.lagged[w, c, 0] = steer_target
     worlds.lagged[w, c, 1] = speed_target
 
@@ -123,7 +114,7 @@ def _collide(atlas, worlds, w):
         dx = worlds.state[w, c, column.X] - worlds.before[w, c, 0]
         dy = worlds.state[w, c, column.Y] - worlds.before[w, c, 1]
         moved = math.sqrt(dx * dx + dy * dy)
-        shorter = min(worlds.params[w, c, LENGTH], worlds.params[w, c, WIDTH])
+        shorter = min(worlds.params[w, c].length, worlds.params[w, c].width)
         checks = max(checks, math.ceil(2.0 * moved / shorter))
     track = worlds.track[w]
     for check in range(1, checks + 1):
@@ -132,7 +123,7 @@ def _collide(atlas, worlds, w):
             if worlds.contact[w, c] != FREE:
                 continue
             x, y, yaw = _between(worlds, w, c, share)
-            length, width = 0.5 * worlds.params[w, c, LENGTH], 0.5 * worlds.params[w, c, WIDTH]
+            length, width = 0.5 * worlds.params[w, c].length, 0.5 * worlds.params[w, c].width
             if touches_wall(atlas, track, x, y, yaw, length, width):
                 _park(worlds, w, c, x, y, yaw, HIT_WALL, abs(worlds.state[w, c, column.SPEED]))
         for c in range(cars):
@@ -145,8 +136,8 @@ def _collide(atlas, worlds, w):
                 x2, y2, yaw2 = _between(worlds, w, other, share)
                 p1, p2 = worlds.params[w, c], worlds.params[w, other]
                 if rectangles_overlap(
-                    x1, y1, yaw1, 0.5 * p1[LENGTH], 0.5 * p1[WIDTH],
-                    x2, y2, yaw2, 0.5 * p2[LENGTH], 0.5 * p2[WIDTH],
+                    x1, y1, yaw1, 0.5 * p1.length, 0.5 * p1.width,
+                    x2, y2, yaw2, 0.5 * p2.length, 0.5 * p2.width,
                 ):  # fmt: skip
                     impact = _relative_speed(worlds.state[w, c], worlds.state[w, other])
                     _park(worlds, w, c, x1, y1, yaw1, HIT_CAR, impact)
@@ -234,21 +225,21 @@ def _scan(atlas, constants, worlds, w, c):
         return
     p, state = worlds.params[w, c], worlds.state[w, c]
     yaw = float(state[column.YAW])
-    x = state[column.X] + p[MOUNT_X] * math.cos(yaw)
-    y = state[column.Y] + p[MOUNT_X] * math.sin(yaw)
+    x = state[column.X] + p.mount_x * math.cos(yaw)
+    y = state[column.Y] + p.mount_x * math.sin(yaw)
     beam_cos, beam_sin = constants.beam_cos, constants.beam_sin
-    cast_walls(atlas, worlds.track[w], x, y, yaw, beam_cos, beam_sin, p[MAX_RANGE], scan)
+    cast_walls(atlas, worlds.track[w], x, y, yaw, beam_cos, beam_sin, p.max_range, scan)
     for other in range(worlds.state.shape[1]):
         if other == c or worlds.contact[w, other] == REMOVED:
             continue
         body, size = worlds.state[w, other], worlds.params[w, other]
         dx, dy = body[column.X] - x, body[column.Y] - y
-        reach = p[MAX_RANGE] + size[LENGTH]
+        reach = p.max_range + size.length
         if dx * dx + dy * dy < reach * reach:
             cast_car(
                 x, y, yaw, beam_cos, beam_sin,
                 float(body[column.X]), float(body[column.Y]), float(body[column.YAW]),
-                0.5 * size[LENGTH], 0.5 * size[WIDTH], scan,
+                0.5 * size.length, 0.5 * size.width, scan,
             )  # fmt: skip
     key = hash64(hash64(worlds.key[w], np.uint64(worlds.tick[w])), np.uint64(c))
     spoil(p, key, scan)
@@ -290,7 +281,7 @@ def _put(atlas, constants, worlds, w, c, start):
     rows, spacing = atlas.index[track, ROWS], atlas.frame[track, SPACING]
     x, y, heading = frenet_point(atlas.line, atlas.index[track, FIRST_ROW], rows, spacing, start[0], start[1])
     p, state = worlds.params[w, c], worlds.state[w, c]
-    p[KINEMATIC_SPEED] = kinematic_speed(p, constants.timestep / constants.substeps, constants.integrator)
+    p.kinematic_speed = kinematic_speed(p, constants.timestep / constants.substeps, constants.integrator)
     speed = float(start[3])
     state[:] = 0.0
     state[column.X], state[column.Y] = x, y
@@ -337,7 +328,7 @@ def _reset_world(atlas, constants, worlds, w, key, track, params, starts):
     worlds.time[w] = 0.0
     worlds.tick[w] = 0
     for c in range(worlds.state.shape[1]):
-        worlds.params[w, c, :] = params[c]
+        worlds.params[w, c] = params[c]
         _place(atlas, constants, worlds, w, c, starts[c])
     _collide(atlas, worlds, w)
     for c in range(worlds.state.shape[1]):
@@ -353,7 +344,7 @@ def reset_worlds(atlas, constants, worlds, which, keys, tracks, params, starts):
         which: (n,) indices of the worlds.
         keys: uint64 (n,) of their random numbers.
         tracks: (n,) numbers in the atlas.
-        params: (n, cars, N_PARAMS).
+        params: PARAMETERS (n, cars).
         starts: (n, cars, 4) arc length [m], offset [m], heading error [rad], speed [m/s].
     """
     for i in prange(which.shape[0]):
@@ -375,7 +366,7 @@ def _respawn(atlas, constants, worlds, w, c, clearance):
         if dx * dx + dy * dy < clearance * clearance:
             return
     p = worlds.params[w, c]
-    if not touches_wall(atlas, track, x, y, yaw, 0.5 * p[LENGTH], 0.5 * p[WIDTH]):
+    if not touches_wall(atlas, track, x, y, yaw, 0.5 * p.length, 0.5 * p.width):
         _put(atlas, constants, worlds, w, c, start)
         _scan(atlas, constants, worlds, w, c)
 

@@ -31,7 +31,6 @@ from outlap.simulator.atlas import (
     cell_clearance,
     to_grid,
 )
-from outlap.simulator.vehicle import BIAS, DROPOUT, MAX_RANGE, NOISE_STD
 
 LANES = 8
 SLOTS = 4
@@ -229,16 +228,16 @@ def spoil(p, key, ranges_io):
         key: uint64, new for every scan.
         ranges_io: (beams,) [m].
     """
-    farthest = p[MAX_RANGE]
-    if p[NOISE_STD] == 0.0 and p[BIAS] == 0.0 and p[DROPOUT] == 0.0:
+    farthest = p.max_range
+    if p.noise_std == 0.0 and p.bias == 0.0 and p.dropout == 0.0:
         return
-    dropped = np.uint64(np.float64(p[DROPOUT]) * 2.0**32)
+    dropped = np.uint64(np.float64(p.dropout) * 2.0**32)
     for k in range(ranges_io.shape[0]):
         bits = hash64(key, np.uint64(k))
         value = ranges_io[k]
         if value < farthest:
             noise = NORMAL[bits & np.uint64(QUANTILES - 1)]
-            value = min(max(value + p[BIAS] + p[NOISE_STD] * noise, _f4(0)), farthest)
+            value = min(max(value + p.bias + p.noise_std * noise, _f4(0)), farthest)
         if (bits >> np.uint64(32)) < dropped:
             value = farthest
         ranges_io[k] = value

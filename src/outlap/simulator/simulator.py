@@ -16,7 +16,7 @@ from outlap.simulator.collision import REMOVED
 from outlap.simulator.dynamics import DRIFT, EULER, KINEMATIC, RK4, SINGLE_TRACK
 from outlap.simulator.lidar import beam_directions
 from outlap.simulator.state import N_STATE
-from outlap.simulator.vehicle import N_PARAMS, SPEED_DELAY, STEER_DELAY, accepted_rows, parameter_names
+from outlap.simulator.vehicle import PARAMETERS, accepted_bounds, parameter_names, to_values
 from outlap.track.track import Track
 
 MODELS = {"kinematic": KINEMATIC, "single_track": SINGLE_TRACK, "drift": DRIFT}
@@ -89,7 +89,7 @@ class Simulator:
             track=np.zeros(num_worlds, np.int32),
             time=np.zeros(num_worlds),
             tick=np.zeros(num_worlds, np.int64),
-            params=np.zeros((*cars, N_PARAMS), np.float32),
+            params=np.zeros(cars, PARAMETERS),
             state=np.zeros((*cars, N_STATE), np.float32),
             before=np.zeros((*cars, 3), np.float32),
             delayed=np.zeros((*cars, slots, 2), np.float32),
@@ -124,7 +124,7 @@ class Simulator:
             which: (n,) indices of worlds.
             keys: uint64 (n,), the key of each world's sensor noise.
             tracks: (n,) positions in `tracks`.
-            params: (n, cars, N_PARAMS), see `vehicle.parameter_bounds`; within `vehicle.accepted_rows`.
+            params: (n, cars) records of `vehicle.PARAMETERS`, within `vehicle.accepted_bounds`.
             starts: (n, cars, 4) arc length [m], offset to the left [m], heading error [rad], speed [m/s].
         """
         which = np.asarray(which)
@@ -133,11 +133,12 @@ class Simulator:
         n, cars = len(which), self.num_cars
         keys = np.ascontiguousarray(keys, np.uint64)
         tracks = np.ascontiguousarray(tracks, np.int32)
-        params = np.ascontiguousarray(params, np.float32)
+        _check(params.dtype == PARAMETERS, "params", f"of type {params.dtype}", "it must be vehicle.PARAMETERS")
+        params = np.ascontiguousarray(params)
         starts = np.ascontiguousarray(starts, np.float64)
         _check_shape("keys", keys, (n,))
         _check_shape("tracks", tracks, (n,))
-        _check_shape("params", params, (n, cars, N_PARAMS))
+        _check_shape("params", params, (n, cars))
         _check_shape("starts", starts, (n, cars, 4))
         if n == 0:
             return
@@ -150,7 +151,7 @@ class Simulator:
         _check_rows(params)
         _check(bool(np.isfinite(starts).all()), "starts", "NaN or infinity", "it must be finite")
         slots = self.worlds.delayed.shape[2]
-        late = max(params[..., STEER_DELAY].max(), params[..., SPEED_DELAY].max()) / self.config.timestep
+        late = max(params["steer_delay"].max(), params["speed_delay"].max()) / self.config.timestep
         if late >= slots - 0.5 + 1e-3:
             _check(False, "params", f"a delay of {late:.1f} steps", "raise max_delay")
         self._timed(
@@ -220,11 +221,12 @@ def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 def _check_rows(params: np.ndarray) -> None:
     """Refuse what no configuration gives: a car without mass or wheelbase is nowhere, and its scan reads anywhere."""
-    low, high = accepted_rows()
-    accepted = (params >= low) & (params <= high)
+    values = to_values(params)
+    low, high = accepted_bounds()
+    accepted = (values >= low) & (values <= high)
     if not accepted.all():
         world, car, column = np.argwhere(~accepted)[0]
-        name, value = parameter_names()[column], params[world, car, column]
+        name, value = parameter_names()[column], values[world, car, column]
         raise OutlapError(
             f"simulator: params: {name} of car {car} in row {world} is {value:g}; "
             f"it must be in [{low[column]:g}, {high[column]:g}]"

@@ -12,35 +12,6 @@ import math
 
 from numba import njit
 
-from outlap.simulator.vehicle import (
-    MU,
-    P_CX1,
-    P_CY1,
-    P_DX1,
-    P_DY1,
-    P_EX1,
-    P_EY1,
-    P_HX1,
-    P_KX1,
-    P_KY1,
-    P_VX1,
-    R_BX1,
-    R_BX2,
-    R_BY1,
-    R_BY2,
-    R_BY3,
-    R_CX1,
-    R_CY1,
-    R_EX1,
-    R_EY1,
-    R_HX1,
-    R_HY1,
-    R_VY1,
-    R_VY4,
-    R_VY5,
-    R_VY6,
-)
-
 
 @njit(cache=True, error_model="numpy")
 def _magic_angle(slope_slip, shape, curvature):
@@ -61,39 +32,37 @@ def tyre_forces(slip, slip_angle, load, p):
     Returns:
         longitudinal, lateral [N].
     """
-    friction = 1.0 * p[MU]  # a float64 from here on
+    friction = 1.0 * p.mu  # a float64 from here on
     # Pacejka's lambda_mu: it scales the peaks and leaves the slopes at the origin alone.
-    peak_x = p[P_DX1] * friction / p[P_DY1]
+    peak_x = p.p_dx1 * friction / p.p_dy1
 
     # Pure slip. The load cancels in the stiffness factors B = K / (C D).
     # CommonRoad adds the vertical shift inside the sine, in newtons; for a 1:10 car it is 1e-4.
-    stiffness_x = p[P_KX1] / (p[P_CX1] * peak_x)
-    pure_x = (
-        peak_x * load * math.sin(_magic_angle(stiffness_x * (p[P_HX1] - slip), p[P_CX1], p[P_EX1]) + load * p[P_VX1])
-    )
-    stiffness_y = p[P_KY1] / (p[P_CY1] * friction)
-    pure_y = friction * load * math.sin(_magic_angle(stiffness_y * slip_angle, p[P_CY1], p[P_EY1]))
+    stiffness_x = p.p_kx1 / (p.p_cx1 * peak_x)
+    pure_x = peak_x * load * math.sin(_magic_angle(stiffness_x * (p.p_hx1 - slip), p.p_cx1, p.p_ex1) + load * p.p_vx1)
+    stiffness_y = p.p_ky1 / (p.p_cy1 * friction)
+    pure_y = friction * load * math.sin(_magic_angle(stiffness_y * slip_angle, p.p_cy1, p.p_ey1))
 
     # Combined slip: each force times a cosine magic formula of the other slip, 1 where that is 0.
     # 1 / sqrt(1 + x^2) is cos(arctan x).
-    slope = p[R_BX1] / math.sqrt(1.0 + (p[R_BX2] * slip) ** 2)
+    slope = p.r_bx1 / math.sqrt(1.0 + (p.r_bx2 * slip) ** 2)
     force_x = (
         pure_x
-        * math.cos(_magic_angle(slope * (slip_angle + p[R_HX1]), p[R_CX1], p[R_EX1]))
-        / math.cos(_magic_angle(slope * p[R_HX1], p[R_CX1], p[R_EX1]))
+        * math.cos(_magic_angle(slope * (slip_angle + p.r_hx1), p.r_cx1, p.r_ex1))
+        / math.cos(_magic_angle(slope * p.r_hx1, p.r_cx1, p.r_ex1))
     )
-    slope = p[R_BY1] / math.sqrt(1.0 + (p[R_BY2] * (slip_angle - p[R_BY3])) ** 2)
+    slope = p.r_by1 / math.sqrt(1.0 + (p.r_by2 * (slip_angle - p.r_by3)) ** 2)
     side_force = (
         friction
         * load
-        * p[R_VY1]
-        / math.sqrt(1.0 + (p[R_VY4] * slip_angle) ** 2)
-        * math.sin(p[R_VY5] * math.atan(p[R_VY6] * slip))
+        * p.r_vy1
+        / math.sqrt(1.0 + (p.r_vy4 * slip_angle) ** 2)
+        * math.sin(p.r_vy5 * math.atan(p.r_vy6 * slip))
     )
     force_y = (
         pure_y
-        * math.cos(_magic_angle(slope * (slip + p[R_HY1]), p[R_CY1], p[R_EY1]))
-        / math.cos(_magic_angle(slope * p[R_HY1], p[R_CY1], p[R_EY1]))
+        * math.cos(_magic_angle(slope * (slip + p.r_hy1), p.r_cy1, p.r_ey1))
+        / math.cos(_magic_angle(slope * p.r_hy1, p.r_cy1, p.r_ey1))
         + side_force
     )
     return force_x, force_y

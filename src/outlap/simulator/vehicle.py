@@ -1,8 +1,8 @@
-"""What a car is: its parameters, with units, ranges and presets, and the row that the kernels read.
+"""The parameters of a car: configuration models with units, ranges and presets, and the record that kernels read.
 
-Every numeric field is a `Number`: a value, or a range (min, max) from which each reset draws anew.
-A car of the simulator is one float32 row of `N_PARAMS` columns; `parameter_bounds` gives the smallest
-and the largest row of a configuration.
+Every numeric field of a model is a `Number`: a value, or a range (min, max) from which each reset samples.
+A car of the simulator is one record of the dtype `PARAMETERS`, which has a float32 field for each of them:
+kernels read `p.mu`, Python reads `params["mu"]`. A new field of a model is a new field of the records.
 """
 
 from __future__ import annotations
@@ -13,68 +13,6 @@ from typing import Annotated
 import numpy as np
 
 from outlap.config import Config, Number, bounded, bounds, widest
-
-# Columns of a car's parameter row. They follow the order of the fields below (a test holds them to it).
-MU = 0
-C_SF = 1
-C_SR = 2
-LF = 3
-LR = 4
-H = 5
-M = 6
-I = 7  # noqa: E741 - the moment of inertia, by the name that the field has everywhere
-WIDTH = 8
-LENGTH = 9
-STEER_MIN = 10
-STEER_MAX = 11
-STEER_RATE_MAX = 12
-A_MAX = 13
-V_SWITCH = 14
-V_MIN = 15
-V_MAX = 16
-WHEEL_RADIUS = 17
-WHEEL_INERTIA = 18
-BRAKE_SPLIT = 19
-ENGINE_SPLIT = 20
-P_CX1 = 21
-P_DX1 = 22
-P_EX1 = 23
-P_KX1 = 24
-P_HX1 = 25
-P_VX1 = 26
-R_BX1 = 27
-R_BX2 = 28
-R_CX1 = 29
-R_EX1 = 30
-R_HX1 = 31
-P_CY1 = 32
-P_DY1 = 33
-P_EY1 = 34
-P_KY1 = 35
-R_BY1 = 36
-R_BY2 = 37
-R_BY3 = 38
-R_CY1 = 39
-R_EY1 = 40
-R_HY1 = 41
-R_VY1 = 42
-R_VY4 = 43
-R_VY5 = 44
-R_VY6 = 45
-STEER_GAIN = 46
-STEER_DELAY = 47
-STEER_LAG = 48
-SPEED_GAIN = 49
-SPEED_DELAY = 50
-SPEED_LAG = 51
-MOUNT_X = 52
-MAX_RANGE = 53
-NOISE_STD = 54
-BIAS = 55
-DROPOUT = 56
-KINEMATIC_SPEED = 57  # [m/s] not the user's: `dynamics.kinematic_speed` of the car, filled at reset
-N_PARAMS = 58
-
 
 # What a `Number` of a car may be: from a toy to a lorry. Beyond, single precision or the integrator gives way.
 Friction = Annotated[Number, bounded(at_least=0.01, at_most=10)]  # [-]
@@ -194,10 +132,46 @@ PRESETS: dict[str, VehicleParams] = {
 }
 
 
+# The models that make up a car, each with the prefix of its parameters in results.
+_MODELS: tuple[tuple[str, type[Config]], ...] = (
+    ("vehicle", VehicleParams),
+    ("vehicle_tyre", PacejkaTyre),
+    ("actuators", ActuatorParams),
+    ("lidar", LidarParams),
+)
+_FIELDS = [
+    (prefix, model, name)
+    for prefix, model in _MODELS
+    for name, field in model.model_fields.items()
+    if not isinstance(field.default, Config)
+]
+
+NAMES = (*(name for _, _, name in _FIELDS), "kinematic_speed")
+"""A car's parameters: the numbers of its models in the order of their fields, and `kinematic_speed` [m/s].
+
+The simulator sets the last one to `dynamics.kinematic_speed` of the car at each reset.
+"""
+
+N_PARAMS = len(NAMES)
+
+PARAMETERS = np.dtype([(name, np.float32) for name in NAMES], align=True)
+"""A car's parameters as a record, without padding."""
+
+
+def to_records(values: np.ndarray) -> np.ndarray:
+    """Return rows of numbers, (..., N_PARAMS), as records of `PARAMETERS`, (...); a view where they are float32."""
+    return np.ascontiguousarray(values, np.float32).view(PARAMETERS)[..., 0]
+
+
+def to_values(params: np.ndarray) -> np.ndarray:
+    """Return records of `PARAMETERS`, (...), as float32 rows, (..., N_PARAMS); a view where they are contiguous."""
+    return np.ascontiguousarray(params)[..., None].view(np.float32).reshape(*params.shape, N_PARAMS)
+
+
 def parameter_bounds(
     vehicle: VehicleParams, actuators: ActuatorParams | None = None, lidar: LidarParams | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest parameter row of a configuration.
+    """Return the smallest and the largest value of each parameter of a configuration.
 
     Args:
         vehicle: the car.
@@ -205,41 +179,32 @@ def parameter_bounds(
         lidar: its scanner; none gives the default one.
 
     Returns:
-        low, high: float32 (N_PARAMS,) each, equal where a value is fixed. Draw uniformly between them.
-        KINEMATIC_SPEED is 0 in both: fill it with `dynamics.kinematic_speed` of each row drawn.
+        low, high: float32 (N_PARAMS,) each, equal where a value is fixed. Sample uniformly between them and pass the
+        rows to `to_records`. `kinematic_speed` is 0 in both.
     """
-    parts = _parts(vehicle, actuators or ActuatorParams(), lidar or LidarParams())
-    ends = [bounds(getattr(part, name)) for _, part in parts for name in _numbers(part)]
-    ends.append((0.0, 0.0))  # KINEMATIC_SPEED
-    table = np.array(ends, dtype=np.float32)
-    return table[:, 0].copy(), table[:, 1].copy()
+    parts = {
+        VehicleParams: vehicle,
+        PacejkaTyre: vehicle.tyre,
+        ActuatorParams: actuators or ActuatorParams(),
+        LidarParams: lidar or LidarParams(),
+    }
+    ends = [bounds(getattr(parts[model], name)) for _, model, name in _FIELDS]
+    low, high = np.array([*ends, (0.0, 0.0)], np.float32).T.copy()
+    return low, high
 
 
 @cache
-def accepted_rows() -> tuple[np.ndarray, np.ndarray]:
-    """The ends of what a parameter row may hold, whatever the configuration: float32 (N_PARAMS,) each.
+def accepted_bounds() -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest value that any configuration accepts: float32 (N_PARAMS,) each.
 
-    A car's v_max may be 0 too: that of an opponent that is to stand.
+    `v_max` may also be 0: an opponent that stands still.
     """
-    parts = _parts(VehicleParams(), ActuatorParams(), LidarParams())
-    ends = [widest(type(part), name) for _, part in parts for name in _numbers(part)]
-    ends.append((0.0, float(np.finfo(np.float32).max)))  # KINEMATIC_SPEED
-    low, high = np.array(ends, dtype=np.float32).T
-    low[V_MAX] = 0.0
+    ends = [widest(model, name) for _, model, name in _FIELDS]
+    low, high = np.array([*ends, (0.0, np.finfo(np.float32).max)], np.float32).T.copy()
+    low[NAMES.index("v_max")] = 0.0
     return low, high
 
 
 def parameter_names() -> list[str]:
-    """What each column of a parameter row is called in results: `vehicle_mu`, `lidar_noise_std`."""
-    parts = _parts(VehicleParams(), ActuatorParams(), LidarParams())
-    return [f"{prefix}_{name}" for prefix, part in parts for name in _numbers(part)] + ["kinematic_speed"]
-
-
-def _parts(vehicle: VehicleParams, actuators: ActuatorParams, lidar: LidarParams) -> list[tuple[str, Config]]:
-    """What a parameter row is made of, in the order of its columns."""
-    return [("vehicle", vehicle), ("vehicle_tyre", vehicle.tyre), ("actuators", actuators), ("lidar", lidar)]
-
-
-def _numbers(config: Config) -> list[str]:
-    """The names of the numeric fields, in order; nested configurations left out."""
-    return [name for name in type(config).model_fields if not isinstance(getattr(config, name), Config)]
+    """Return the name of each parameter in results: `vehicle_mu`, `lidar_noise_std`."""
+    return [f"{prefix}_{name}" for prefix, _, name in _FIELDS] + ["kinematic_speed"]
