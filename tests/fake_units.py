@@ -16,7 +16,6 @@ class Fake(Unit):
     """Writes when it began and ended, and how often; may fail, and may take long."""
 
     kind = "fakes"
-    learns = False
     before: tuple[Fake, ...] = ()
     fails: bool = False
     dies: bool = False  # takes its process with it
@@ -27,8 +26,8 @@ class Fake(Unit):
     on_track: str | None = None
 
     @property
-    def seconds(self) -> float:
-        return 0.05 * self.ticks
+    def size(self) -> float:
+        return self.ticks
 
     @property
     def tracks(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from outlap.cli.main import main
 from outlap.drivers.ghost import Ghost
 from outlap.drivers.population import read_manifest
 from outlap.experiments.engine import Engine
-from outlap.experiments.population import OpponentUnit
+from outlap.experiments.opponent_units import OpponentUnit
 from outlap.track.map_io import write_track
 from outlap.training.population import Opponent
 from small_populations import driver, population, ring_driver, save_population

@@ -12,8 +12,8 @@ from outlap.config import bounds
 from outlap.errors import OutlapError
 from outlap.experiments.definitions import FOLDERS, Budget
 from outlap.experiments.plan import Plan, artefacts, make_plan, remember_tracks
-from outlap.experiments.population import OpponentUnit
-from outlap.experiments.units import ClippingUnit, RaceUnit, TrainingUnit, adaptation_settings
+from outlap.experiments.opponent_units import OpponentUnit
+from outlap.experiments.paper_units import ClippingUnit, RaceUnit, TrainingUnit, adaptation_settings
 from outlap.mql.propensity import AdaptiveBetaClip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -15,8 +16,8 @@ import pytest
 from fake_units import Fake, begun, ended
 from outlap.errors import OutlapError
 from outlap.experiments.engine import LocalEngine
-from outlap.experiments.runner import Status, _Pace, run_units
-from outlap.experiments.unit import done_record
+from outlap.experiments.runner import Status, estimate_seconds, finished_rates, run_units
+from outlap.experiments.unit import Unit, done_record
 
 
 def test_units_wait_for_what_they_need_and_are_done_once(tmp_path: Path):
@@ -29,7 +30,8 @@ def test_units_wait_for_what_they_need_and_are_done_once(tmp_path: Path):
     assert os.environ == before
     assert begun(last, tmp_path)[0] >= max(ended(first, tmp_path), ended(second, tmp_path))
     assert (seen[-1].done, seen[-1].units, seen[-1].running) == (3, 3, ())
-    assert seen[-1].work_done == pytest.approx(seen[-1].work)
+    assert seen[-1].share == 1.0
+    assert seen[-1].seconds_left == 0.0
     assert done_record(first, tmp_path)["seconds"] >= 0.1
     run_units([first, second, last], tmp_path, LocalEngine(2))
     assert [len(begun(unit, tmp_path)) for unit in (first, second, last)] == [1, 1, 1]
@@ -68,7 +70,8 @@ def test_a_process_that_dies_takes_no_other_unit_with_it(tmp_path: Path):
 def test_a_process_that_dies_before_the_next_unit_is_submitted(busy: bool, tmp_path: Path):
     engine, released = LocalEngine(2), tmp_path / "released"
     first, second = Fake("first", until=str(released)), Fake("second")
-    engine.open([first, second], tmp_path)
+    engine.open(tmp_path)
+    assert engine._workers is not None
     try:
         engine.submit(first)
         wait_for(lambda: begun(first, tmp_path))
@@ -76,8 +79,8 @@ def test_a_process_that_dies_before_the_next_unit_is_submitted(busy: bool, tmp_p
         if not busy:
             released.touch()
             wait_for(lambda: outcomes.extend(engine.wait(0.1)) or outcomes)
-        os.kill(next(iter(engine._pool._processes)), signal.SIGKILL)
-        wait_for(lambda: engine._pool._broken)
+        os.kill(next(iter(engine._workers.pool._processes)), signal.SIGKILL)
+        wait_for(lambda: engine._workers.pool._broken)
         engine.submit(second)
         released.touch()
         wait_for(lambda: outcomes.extend(engine.wait(0.1)) or len(outcomes) == 2)
@@ -138,14 +141,33 @@ def test_after_ctrl_c_or_a_kill_the_same_units_go_on(by: signal.Signals, tmp_pat
 
 def test_estimates_follow_what_units_really_took(tmp_path: Path):
     units = [Fake(f"unit {number}", ticks=20) for number in range(8)]
-    pace = _Pace(units, tmp_path)
-    assert pace.status(0, {}, units, slots=2).seconds_left == pytest.approx(8 * 1.0 / 2)
-    for unit in units[:4]:
-        pace.note(unit, 3.0)  # three times as long as was thought
-    left = pace.status(0, {}, units[4:], slots=2).seconds_left
-    assert 4 * 1.0 / 2 < left < 4 * 3.0 / 2
-    assert left == pytest.approx(4 * (4 * 3.0 + 1.0) / 5 / 2)
+    assert estimate_seconds(units, finished_rates(tmp_path), slots=2, shares={}) is None  # nothing has finished
+    for unit, seconds in zip(units[:4], (1.0, 2.0, 3.0, 6.0), strict=True):
+        folder = unit.folder(tmp_path)
+        folder.mkdir(parents=True)
+        record = {"seconds": seconds, "category": unit.category, "size": unit.size}
+        (folder / "done.json").write_text(json.dumps(record))
+    rates = finished_rates(tmp_path)
+    assert estimate_seconds(units[4:], rates, slots=2, shares={}) == pytest.approx(4 * 3.0 / 2)
+    assert estimate_seconds([Fake("twice", ticks=40)], rates, slots=2, shares={}) == pytest.approx(6.0)
     # The last unit cannot be shared.
-    last = pace.status(7, {units[7].key: 0.5}, [units[7]], slots=2)
-    assert last.seconds_left == pytest.approx(0.5 * (4 * 3.0 + 1.0) / 5)
-    assert last.running == ("unit 7",)
+    assert estimate_seconds(units[7:], rates, slots=2, shares={units[7].key: 0.5}) == pytest.approx(1.5)
+    assert estimate_seconds([], rates, slots=2, shares={}) == 0.0
+
+
+def test_units_that_follow_from_finished_ones_are_done_too(tmp_path: Path):
+    first, second = Fake("first"), Fake("second")
+    last = Fake("last", before=(first, second))
+    finished: list[str] = []
+
+    def on_done(unit: Unit) -> list[Unit]:
+        finished.append(unit.name)
+        return [last] if {"first", "second"} == {*finished} else []
+
+    run_units([first, second], tmp_path, LocalEngine(2), on_done=on_done)
+    assert sorted(finished) == ["first", "last", "second"]
+    assert last.is_done(tmp_path)
+    finished.clear()
+    run_units([first, second], tmp_path, LocalEngine(2), on_done=on_done)  # finished ones are reported again
+    assert finished == ["first", "second", "last"]
+    assert [len(begun(unit, tmp_path)) for unit in (first, second, last)] == [1, 1, 1]

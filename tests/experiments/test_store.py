@@ -13,7 +13,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fake_units import Fake
 from outlap.errors import OutlapError
 from outlap.experiments import ray_engine
-from outlap.experiments.ray_engine import Surroundings, _do_with_store, _Orders, _Progress
+from outlap.experiments.ray_engine import run_with_store
 from outlap.experiments.store import Store
 from outlap.experiments.unit import Report, Unit
 
@@ -93,14 +93,13 @@ class Failing(Store):
 def done_with(store: Failing, unit: Unit, folder: Path) -> None:
     """The unit, done on a machine of a cluster that copies it after every report."""
     folder.mkdir()
-    orders = _Orders(folder, store.url, {}, Surroundings.here())
-    _do_with_store(unit, orders, folder, store, _Progress(unit, board=None))
+    run_with_store(unit, folder, store, report=lambda share: None)
 
 
 def test_an_error_of_a_copy_costs_no_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(ray_engine, "STORE_EVERY", 0.0)
+    monkeypatch.setattr(ray_engine, "STORE_INTERVAL", 0.0)
     store, unit = Failing(f"file://{tmp_path / 'store'}"), Fake("long", ticks=3)
     store.fails = ".tar"  # the last one, which is not passed over
     with pytest.raises(OSError, match="no network"):

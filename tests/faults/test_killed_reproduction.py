@@ -64,7 +64,7 @@ def test_a_reproduction_that_is_killed_and_interrupted(
     assert interrupted.seconds < 10.0
     assert interrupted.said == "\nsaved; go on with the same command\noutlap reproduce: interrupted\n"
     assert not (tmp_path / "stopped" / "results.json").exists()
-    monkeypatch.setattr("outlap.experiments.engine.ProcessPoolExecutor", OneProcess)
+    monkeypatch.setattr("outlap.experiments.workers.ProcessPoolExecutor", OneProcess)
     for folder in ("stopped", "undisturbed"):
         assert main([*WORDS, folder]) == 0
     rows, same = (pd.read_parquet(tmp_path / folder / "episodes.parquet") for folder in ("stopped", "undisturbed"))

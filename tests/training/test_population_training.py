@@ -17,7 +17,7 @@ from outlap.drivers.population import MANIFEST, Member, file_hashes, load_popula
 from outlap.envs.race_config import RaceConfig
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.engine import LocalEngine
-from outlap.experiments.population import OpponentUnit, enter_all
+from outlap.experiments.opponent_units import OpponentUnit, enter_all
 from outlap.experiments.runner import run_units
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track.map_io import write_track

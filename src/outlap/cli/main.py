@@ -1,6 +1,6 @@
 """`outlap`: finds the command, runs it, and turns every mistake into one line and an exit code.
 
-Exit codes: 0 done; 1 a bug, with its traceback; 2 wrong arguments or bad input; 130 after Ctrl-C; 141 when
+Exit codes: 0 done; 1 a bug, with its traceback; 2 wrong arguments or bad input; 130 after Ctrl-C or SIGTERM; 141 when
 the reader of the output has gone. Only the module of the command that was asked for is imported.
 """
 
@@ -12,11 +12,12 @@ import errno
 import importlib
 import logging
 import os
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from outlap.cli.interrupts import INTERRUPTED, ctrl_c_spares_imports, end_now
+from outlap.cli.interrupts import INTERRUPTED
 from outlap.cli.output import (
     STANDARD_OUTPUT,
     check_json_path,
@@ -79,11 +80,8 @@ COMMANDS = (
 
 def run() -> None:
     """The console script."""
-    with ctrl_c_spares_imports():
-        code = main()
-    if code == INTERRUPTED:
-        end_now(code)
-    sys.exit(code)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
+    sys.exit(main())
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -66,7 +66,7 @@ class TrainOpponents(WorkFlags):
     """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
-        from outlap.experiments.population import OpponentUnit, enter_all
+        from outlap.experiments.opponent_units import OpponentUnit, enter_all
         from outlap.track import load_track
 
         check_least("--laps", self.laps, 1)

@@ -69,7 +69,7 @@ class Reproduce(WorkFlags):
         folder = self.out or Path("runs") / f"reproduce-{plan.budget_name}"
         work = folder / "work"
         if self.dry_run:
-            return _dry(plan.units, [unit for unit in plan.units if not unit.is_done(work)], self.jobs)
+            return _dry_run(plan.units, work, self.jobs or os.cpu_count() or 1)
         self.do_units(plan.units, work, "reproducing", self.quiet)
         data = write_report(plan, folder)
         return CommandResult({**data, "folder": folder}, lambda console: _print(console, data, folder))
@@ -84,21 +84,20 @@ def _cell(entry: Mapping[str, Any]) -> Text:
     return Text(text + (f" ({entry['published']:g})" if isinstance(entry["published"], (int, float)) else ""))
 
 
-def _dry(units: Sequence[Unit], missing: Sequence[Unit], jobs: int) -> CommandResult:
-    seconds = sum(unit.seconds for unit in missing) / (jobs or os.cpu_count() or 1)
-    kinds = {kind: [unit for unit in missing if unit.kind == kind] for kind in dict.fromkeys(u.kind for u in units)}
-    data = {
-        "units": len(units),
-        "missing": {kind: len(found) for kind, found in kinds.items()},
-        "estimated_seconds": round(seconds),
-    }
+def _dry_run(units: Sequence[Unit], work: Path, slots: int) -> CommandResult:
+    """Count the units that are missing, and estimate how long they take."""
+    from outlap.experiments.runner import estimate_seconds, finished_rates
+
+    missing = [unit for unit in units if not unit.is_done(work)]
+    counts = {kind: sum(unit.kind == kind for unit in missing) for kind in dict.fromkeys(unit.kind for unit in units)}
+    seconds = estimate_seconds(missing, finished_rates(work), slots, {})
+    data = {"units": len(units), "missing": counts, "estimated_seconds": None if seconds is None else round(seconds)}
 
     def show(console: Console) -> None:
-        for kind, found in kinds.items():
-            console.print(f"{len(found):5} {kind}", highlight=False)
-        console.print(
-            f"about {duration(seconds)}; {len(units) - len(missing)} of {len(units)} are done", highlight=False
-        )
+        for kind, count in counts.items():
+            console.print(f"{count:5} {kind}", highlight=False)
+        about = "" if seconds is None else f"about {duration(seconds)}; "
+        console.print(f"{about}{len(units) - len(missing)} of {len(units)} are done", highlight=False)
 
     return CommandResult(data, show)
 

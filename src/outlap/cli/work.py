@@ -78,8 +78,9 @@ class WorkFlags(ClusterFlags):
             def show(status: Status) -> None:
                 note = f"{status.done} of {status.units} units"
                 if status.running:
-                    note += f", {duration(status.seconds_left)} left: {', '.join(status.running)}"
-                update(round(1000 * status.work_done / status.work), note)
+                    left = "estimating" if status.seconds_left is None else f"{duration(status.seconds_left)} left"
+                    note += f", {left}: {', '.join(status.running)}"
+                update(round(1000 * status.share), note)
 
             try:
                 run_units(units, work, engine, show)

@@ -1,12 +1,11 @@
-"""What does units of work: an engine. The local one does them in processes of this machine, one thread each."""
+"""Engines do units of work. The local engine does them in processes of this machine, with one thread each."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,17 +15,18 @@ from typing import Protocol
 from filelock import FileLock
 
 from outlap.experiments.unit import DONE, Report, Unit, done_record
+from outlap.experiments.workers import Workers, reporting
 from outlap.files import atomic_write, remove_partials, to_json
-from outlap.processes import Workers, at_work, import_learning, process_environment, report_share, start_worker
+from outlap.processes import process_environment
 
 SECONDS = "seconds.txt"  # how long an unfinished unit has taken so far
-NOTE_EVERY = 10.0  # [s] between two notes of that
+NOTE_INTERVAL = 10.0  # [s] between two updates of that file
 ONE_THREAD = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # a unit keeps one core busy
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a unit ended: the seconds that it took, earlier sessions included, or what went wrong."""
+    """How a unit ended: the seconds that it took in all sessions, or an error."""
 
     unit: Unit
     seconds: float = 0.0
@@ -34,36 +34,40 @@ class Outcome:
 
 
 class Engine(Protocol):
-    """Does units, several at a time. A unit whose process or machine is lost is tried again by the engine itself."""
+    """Does units, several at a time. It retries a unit whose process or machine is lost."""
 
     @property
     def limit(self) -> int:
-        """Units that may be with the engine now."""
+        """Units that may be submitted and unfinished now."""
         ...
 
     @property
     def slots(self) -> int:
-        """Units that it does at a time, for an estimate of the time that is left."""
+        """Units that it does at a time, for an estimate of the time left."""
         ...
 
-    def open(self, units: Sequence[Unit], work: Path) -> None:
-        """Get ready for some units, whose folders are in a folder of work."""
+    def open(self, work: Path) -> None:
+        """Prepare for units of a work folder."""
+        ...
+
+    def fetch(self, units: Sequence[Unit]) -> None:
+        """Bring units that are finished elsewhere into the work folder."""
         ...
 
     def submit(self, unit: Unit) -> None:
-        """Begin a unit, all that it needs being done."""
+        """Begin a unit whose requirements are all done."""
         ...
 
     def wait(self, timeout: float) -> list[Outcome]:
-        """Units that have ended, after so many seconds at most."""
+        """Return units that have ended, after at most `timeout` seconds."""
         ...
 
     def shares(self) -> Mapping[str, float]:
-        """How far the units that run are, by their keys."""
+        """Return the finished share of the units that run, by key."""
         ...
 
     def close(self) -> None:
-        """Let the units that still run save and stop, and give back what `open` took; safe where that failed."""
+        """Let running units save and stop, and release what `open` acquired; safe if that failed."""
         ...
 
 
@@ -71,67 +75,62 @@ class LocalEngine:
     """Processes of this machine.
 
     Args:
-        jobs: units at a time; 0: one a core.
+        jobs: units at a time; 0: one for each core.
     """
 
     def __init__(self, jobs: int = 0) -> None:
         self.slots = jobs or os.cpu_count() or 1
+        self._workers: Workers | None = None
         self._resources = ExitStack()
-        self._running: dict[Future[float], Unit] = {}
-        # Where a process dies, those beside it are lost too: each is tried once more, alone.
+        self._running: dict[Future[float], tuple[Unit, int]] = {}  # with their slots
+        # If a process dies, those beside it are lost too: each of their units is retried once, alone.
         self._lost: set[str] = set()  # keys
-        self._again: list[Unit] = []
+        self._retries: list[Unit] = []
 
     @property
     def limit(self) -> int:
-        alone = self._again or any(unit.key in self._lost for unit in self._running.values())
+        alone = self._retries or any(unit.key in self._lost for unit, _ in self._running.values())
         return 0 if alone else self.slots
 
-    def open(self, units: Sequence[Unit], work: Path) -> None:
+    def open(self, work: Path) -> None:
         self._work = work
-        self._context = multiprocessing.get_context("spawn")
-        self._workers = Workers(self._context, len(units))
-        self._numbers = {unit.key: number for number, unit in enumerate(units)}
         self._resources.enter_context(process_environment(**ONE_THREAD))
-        self._pool = self._new_pool()
-        self._resources.callback(lambda: self._pool.shutdown(wait=True))
+        self._workers = Workers(self.slots)
 
-    def _new_pool(self) -> ProcessPoolExecutor:
-        shared = self._workers.initializer_arguments
-        return ProcessPoolExecutor(self.slots, mp_context=self._context, initializer=start_worker, initargs=shared)
-
-    def _renew_pool(self) -> None:
-        self._pool.shutdown()
-        self._pool = self._new_pool()
+    def fetch(self, units: Sequence[Unit]) -> None:
+        pass
 
     def submit(self, unit: Unit) -> None:
-        number = self._numbers[unit.key]
+        assert self._workers is not None
+        slot = next(iter({*range(self.slots)} - {slot for _, slot in self._running.values()}))
+        task = (slot, _do_in_worker, unit, self._work, slot)
         try:
-            future = self._workers.submit(self._pool, number, _do_in_worker, unit, self._work, number)
+            future = self._workers.submit(*task)
         except BrokenProcessPool:  # a process has died since the last `wait`
             if self._running:
-                self._again.append(unit)  # for `wait`, which hears of those that died with it
+                self._retries.append(unit)  # `wait` learns of the units that died with it
                 return
-            self._renew_pool()
-            future = self._workers.submit(self._pool, number, _do_in_worker, unit, self._work, number)
-        self._running[future] = unit
+            self._workers.restart()
+            future = self._workers.submit(*task)
+        self._running[future] = unit, slot
 
     def wait(self, timeout: float) -> list[Outcome]:
-        if not self._running and self._again:
-            self.submit(self._again.pop(0))
+        assert self._workers is not None
+        if not self._running and self._retries:
+            self.submit(self._retries.pop(0))
         finished, _ = wait(self._running, timeout, FIRST_COMPLETED)
         if any(isinstance(future.exception(), BrokenProcessPool) for future in finished):
             finished, _ = wait(self._running)  # all of them have the same error
-            self._renew_pool()
+            self._workers.restart()
         outcomes = []
         for future in finished:
-            unit = self._running.pop(future)
+            unit, _ = self._running.pop(future)
             match future.exception():
                 case None:
                     outcomes.append(Outcome(unit, future.result()))
                 case BrokenProcessPool() if unit.key not in self._lost:
                     self._lost.add(unit.key)
-                    self._again.append(unit)
+                    self._retries.append(unit)
                 case Exception() as error:
                     outcomes.append(Outcome(unit, error=error))
                 case BaseException() as stop:
@@ -139,51 +138,51 @@ class LocalEngine:
         return outcomes
 
     def shares(self) -> Mapping[str, float]:
-        return {unit.key: self._workers.share[self._numbers[unit.key]] for unit in self._running.values()}
+        progress = self._workers.progress if self._workers else ()
+        return {unit.key: max(0.0, progress[slot]) for unit, slot in self._running.values()}
 
     def close(self) -> None:
-        if self._running:  # after an error or Ctrl-C
-            self._workers.end([(future, self._numbers[unit.key]) for future, unit in self._running.items()])
+        if self._workers is not None:
+            self._workers.end([(future, slot) for future, (_, slot) in self._running.items()])
         self._resources.close()
 
 
-def do_unit(unit: Unit, work: Path, report: Report) -> float:
-    """Do a unit, or go on with it, and note that it is done; returns the seconds it took, earlier sessions included.
+def run_unit(unit: Unit, work: Path, report: Report) -> float:
+    """Do or resume a unit, and mark it as done; return the seconds that it took in all sessions.
 
-    Where `report` raises KeyboardInterrupt, so does this, once what is done is saved.
+    Raise KeyboardInterrupt if `report` does, with the work saved.
     """
     folder = unit.folder(work)
     folder.mkdir(parents=True, exist_ok=True)
-    # Whoever was at work here before, and has lost its parent, may still be saving.
+    # A process that has lost its parent may still be saving here.
     with FileLock(folder / ".lock"):
         remove_partials(folder)
-        before, begun = _seconds_before(folder), time.monotonic()
+        earlier, begun = _seconds_so_far(folder), time.monotonic()
         noted = begun
 
         def note(share: float) -> None:
             nonlocal noted
             now = time.monotonic()
-            if now - noted > NOTE_EVERY:
-                atomic_write(folder / SECONDS, f"{before + now - begun:.1f}\n")
+            if now - noted > NOTE_INTERVAL:
+                atomic_write(folder / SECONDS, f"{earlier + now - begun:.1f}\n")
                 noted = now
             report(share)
 
         if not unit.is_done(work):
             unit.do(work, note)
-            seconds = round(before + time.monotonic() - begun, 1)
-            atomic_write(folder / DONE, to_json({"seconds": seconds, "name": unit.name, "key": unit.key}) + "\n")
+            seconds = round(earlier + time.monotonic() - begun, 1)
+            record = {"seconds": seconds, "name": unit.name, "key": unit.key}
+            atomic_write(folder / DONE, to_json({**record, "category": unit.category, "size": unit.size}) + "\n")
         return float(done_record(unit, work)["seconds"])
 
 
-def _seconds_before(folder: Path) -> float:
+def _seconds_so_far(folder: Path) -> float:
     try:
         return float((folder / SECONDS).read_text())
     except (OSError, ValueError):
         return 0.0
 
 
-def _do_in_worker(unit: Unit, work: Path, number: int) -> float:
-    if unit.learns:
-        import_learning()
-    with at_work(number):
-        return do_unit(unit, work, lambda share: report_share(number, share))
+def _do_in_worker(unit: Unit, work: Path, slot: int) -> float:
+    with reporting(slot) as report:
+        return run_unit(unit, work, report)

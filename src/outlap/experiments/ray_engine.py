@@ -1,73 +1,80 @@
-"""Units of work on the machines of a Ray cluster, or on this one: each a Ray task that declares what it needs.
+"""Do units on the machines of a Ray cluster, or on this one; each unit is a Ray task that declares its resources.
 
-The machines share the folder of work, or hand units to each other through an object store. Where a machine is lost,
-Ray does its units again elsewhere, from what they had saved; those that were done stay done.
+The machines share the work folder, or exchange units through an object store. If a machine is lost, Ray repeats its
+units elsewhere from what they had saved; finished units stay finished.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
+import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from outlap.errors import OutlapError
-from outlap.experiments.engine import Outcome, do_unit
-from outlap.experiments.ray_cluster import MARK, import_ray, ray_cluster
+from outlap.experiments.engine import Outcome, run_unit
 from outlap.experiments.store import Store
-from outlap.experiments.unit import Unit
-from outlap.processes import Interruptible, import_learning
+from outlap.experiments.unit import Report, Unit
 
 log = logging.getLogger(__name__)
 
 RETRIES = 5  # of a unit whose process or machine is lost
-REPORT_EVERY = 1.0  # [s] between two reports of how far a unit is
-STORE_EVERY = 120.0  # [s] between two copies of an unfinished unit in the store
-PATIENCE = 60.0  # [s] for units to save what they have, after Ctrl-C
-QUEUE = 10_000  # units that Ray may have at a time, most of them waiting: that is what clusters grow by
+REPORT_INTERVAL = 1.0  # [s] between two progress reports of a unit
+STORE_INTERVAL = 120.0  # [s] between two copies of an unfinished unit to the store
+SAVING_TIME = 60.0  # [s] for units to save their work after Ctrl-C
+QUEUE = 10_000  # units that Ray may have at a time; clusters grow with those that wait
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What a process of Ray's takes over from the one that the work began in."""
+def import_ray() -> Any:
+    """Return the package. Raise OutlapError if it is not installed."""
+    try:
+        import ray
+    except ImportError:
+        raise OutlapError("Ray is not installed; get it with pip install 'outlap[distributed]'") from None
+    return ray
 
-    folder: Path  # where relative names of tracks begin
-    variables: Mapping[str, str]  # of the environment
 
-    @classmethod
-    def here(cls) -> Surroundings:
-        """Those of this process."""
-        ours = {name: value for name, value in os.environ.items() if name.startswith("OUTLAP_") and name != MARK}
-        return cls(Path.cwd(), ours)
+@contextmanager
+def ray_cluster(address: str | None) -> Iterator[None]:
+    """Join a Ray cluster, or start one on this machine, which ends with the block.
 
-    def settle_in(self) -> None:
-        """Take them over, and keep one core busy, no more."""
-        import numba
-
-        numba.set_num_threads(1)  # PyTorch's are one already: Ray says so by OMP_NUM_THREADS
-        os.environ.update(self.variables)
-        if self.folder.is_dir():
-            os.chdir(self.folder)
+    If this process has joined one already, keep it. Raise OutlapError if no cluster answers.
+    """
+    ray = import_ray()
+    if ray.is_initialized():
+        yield
+        return
+    sigterm = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(address=address, logging_level=logging.WARNING, log_to_driver=False)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, sigterm)  # Ray replaces it
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise OutlapError(f"--address {address}: no Ray cluster answers there: {error}") from None
+    try:
+        yield
+    finally:
+        ray.shutdown()
 
 
 class RayEngine:
     """A Ray cluster.
 
     Args:
-        address: of its head, as `ray.init` takes it; None: RAY_ADDRESS, or else a cluster of this machine alone.
-        store: URL of an object store; None: all machines see the folder of work under the same path.
+        address: of its head, as for `ray.init`; None: RAY_ADDRESS, or else a cluster of this machine alone.
+        store: URL of an object store; None: all machines see the work folder under the same path.
         jobs: units at a time; 0: as many as the cluster has cores.
         gpu_share: of a GPU, for each unit that uses one.
-        tracks: fingerprints that tracks must have on every machine, by their names.
+        tracks: fingerprints that tracks must have on every machine, by name.
 
-    Raises OutlapError where Ray is not installed.
+    Raises OutlapError if Ray is not installed, or the store's URL is not valid.
     """
 
     def __init__(
@@ -94,33 +101,33 @@ class RayEngine:
         cores = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
         return min(self._jobs or cores, cores)
 
-    def open(self, units: Sequence[Unit], work: Path) -> None:
+    def open(self, work: Path) -> None:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         self._work = work.absolute()
         if self._store is not None:
             self._store.check()
-            self._exchange(units, self._store)
         self._resources.enter_context(ray_cluster(self._address))
         here = NodeAffinitySchedulingStrategy(self._ray.get_runtime_context().get_node_id(), soft=True)
-        board = self._ray.remote(_Board).options(
-            num_cpus=0, max_restarts=-1, max_concurrency=QUEUE, scheduling_strategy=here
+        actor = self._ray.remote(ProgressActor).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
+        self._progress = actor.remote()
+        self._context = UnitContext(
+            self._work, self._store.url if self._store else None, self._tracks, WorkerEnvironment.current()
         )
-        self._board = board.remote()
-        url = self._store.url if self._store else None
-        self._orders = _Orders(self._work, url, self._tracks, Surroundings.here())
-        self._task = self._ray.remote(num_cpus=1, max_retries=RETRIES)(_do_there)
-        self.shares()  # once it has answered, it hears at once that units are to stop
+        self._task = self._ray.remote(num_cpus=1, max_retries=RETRIES)(_run_on_node)
 
-    def _exchange(self, units: Sequence[Unit], store: Store) -> None:
-        """Fetch units that are done; put there what was done without the store, of the others and what they need."""
+    def fetch(self, units: Sequence[Unit]) -> None:
+        """See `Engine`; copy to the store what was begun or done without it, and is needed."""
+        store = self._store
+        if store is None:
+            return
         done, begun = store.done(), store.begun()
         needed: dict[str, Unit] = {}
         for unit in units:
             if unit.key in done:
                 store.get(unit, self._work)
                 continue
-            needed |= {each.key: each for each in _all_needs(unit)}
+            needed |= {each.key: each for each in unit.all_needs()}
             if unit.key not in begun and unit.folder(self._work).is_dir():
                 log.info("%s: was begun without %s, and is copied there", unit.name, store.url)
                 store.put_part(unit, self._work)
@@ -131,7 +138,7 @@ class RayEngine:
 
     def submit(self, unit: Unit) -> None:
         task = self._task.options(name=unit.name, num_gpus=self._gpu_share if unit.uses_gpu else 0)
-        self._running[task.remote(unit, self._orders, self._board)] = unit
+        self._running[task.remote(unit, self._context, self._progress)] = unit
 
     def wait(self, timeout: float) -> list[Outcome]:
         finished, _ = self._ray.wait(list(self._running), num_returns=1, timeout=timeout)
@@ -141,212 +148,182 @@ class RayEngine:
         unit = self._running.pop(reference)
         try:
             seconds = self._ray.get(reference)
+            if self._store is not None:
+                self._store.get(unit, self._work)
         except self._ray.exceptions.RayTaskError as error:
             cause = error.cause
             return Outcome(unit, error=cause if isinstance(cause, Exception) else error)
-        except self._ray.exceptions.RayError as error:  # lost more often than it may be tried again
+        except Exception as error:  # lost too often, or an error of the store's file system
             return Outcome(unit, error=error)
-        if self._store is not None:
-            try:
-                self._store.get(unit, self._work)
-            except Exception as error:  # whatever its file system raises: the unit is kept there
-                return Outcome(unit, error=error)
         return Outcome(unit, seconds)
 
     def shares(self) -> Mapping[str, float]:
         try:
-            return self._ray.get(self._board.shares.remote(), timeout=5.0)
-        except self._ray.exceptions.RayError:  # on its way to another machine
+            return self._ray.get(self._progress.shares.remote(), timeout=5.0)
+        except self._ray.exceptions.RayError:  # it restarts on another machine
             return {}
 
     def close(self) -> None:
         with self._resources:
             if self._running:
-                self._end_units()
+                self._stop_units()
 
-    def _end_units(self) -> None:
-        begun = self._stop()
-        for reference, unit in self._running.items():
-            if unit.key not in begun:
-                self._ray.cancel(reference, force=True)  # it may be importing, which is not to be interrupted
-        working = [reference for reference, unit in self._running.items() if unit.key in begun]
-        if working:
-            ended, late = self._ray.wait(working, num_returns=len(working), timeout=PATIENCE)
-            self._warn_of_lost_work(ended, late)
-
-    def _stop(self) -> Mapping[str, float]:
-        """Have units stop; those that have begun, by their keys."""
+    def _stop_units(self) -> None:
+        """Let units save their work, and warn of those that cannot."""
         try:
-            return self._ray.get(self._board.stop.remote(), timeout=PATIENCE)
-        except self._ray.exceptions.RayError as error:  # as where the cluster is gone
+            reported = self._ray.get(self._progress.stop.remote(), timeout=SAVING_TIME)
+        except self._ray.exceptions.RayError as error:
             log.warning("units cannot be told to stop, and are ended: %s", error)
-            return {}
-
-    def _warn_of_lost_work(self, ended: Sequence[Any], late: Sequence[Any]) -> None:
+            reported = {}
+        saving = {reference: unit for reference, unit in self._running.items() if unit.key in reported}
+        for reference in self._running.keys() - saving.keys():  # it has nothing to save
+            self._ray.cancel(reference, force=True)
+        if not saving:
+            return
+        ended, late = self._ray.wait(list(saving), num_returns=len(saving), timeout=SAVING_TIME)
         for reference in late:
-            log.warning("%s has not been saved within %.0f s", self._running[reference].name, PATIENCE)
+            log.warning("%s has not been saved within %.0f s", saving[reference].name, SAVING_TIME)
+            self._ray.cancel(reference, force=True)
         for reference in ended:
             try:
                 self._ray.get(reference)
             except self._ray.exceptions.RayError as error:
-                cause = getattr(error, "cause", None) or error
-                log.warning("%s could not be saved: %s", self._running[reference].name, cause)
+                log.warning("%s could not be saved: %s", saving[reference].name, getattr(error, "cause", error))
 
 
-class _Board:
-    """An actor that units tell how far they are, and that tells them when to stop."""
+class ProgressActor:
+    """Collects the progress of units, and tells them to stop."""
 
     def __init__(self) -> None:
         self._shares: dict[str, float] = {}
-        self._stopped = asyncio.Event()
+        self._stopped = False
 
-    async def report(self, key: str, share: float, patience: float) -> bool:
-        """Note how far a unit is; whether it is to stop: no is the answer after `patience` seconds, yes at once."""
+    def report(self, key: str, share: float) -> bool:
+        """Note the finished share of a unit; return whether it is to stop."""
         self._shares[key] = share
-        with suppress(TimeoutError):
-            await asyncio.wait_for(self._stopped.wait(), patience)
-        return self._stopped.is_set()
+        return self._stopped
 
     def leave(self, key: str) -> None:
-        """A unit does not run any more."""
+        """Forget a unit that has ended."""
         self._shares.pop(key, None)
 
     def shares(self) -> dict[str, float]:
+        """Return the finished shares by key."""
         return self._shares
 
     def stop(self) -> dict[str, float]:
-        """Have all units stop; how far those are that have begun."""
-        self._stopped.set()
+        """Tell all units to stop; return the shares of those that have reported any."""
+        self._stopped = True
         return self._shares
 
 
 @dataclass(frozen=True)
-class _Orders:
-    """What every machine must know."""
+class WorkerEnvironment:
+    """What a worker of Ray takes over from the process that gave the command."""
+
+    folder: Path  # relative names of tracks start here
+    variables: Mapping[str, str]  # of the environment
+
+    @classmethod
+    def current(cls) -> WorkerEnvironment:
+        """Return that of this process."""
+        return cls(Path.cwd(), {name: value for name, value in os.environ.items() if name.startswith("OUTLAP_")})
+
+    def apply(self) -> None:
+        """Take it over, and use one thread."""
+        import numba
+
+        numba.set_num_threads(1)  # Ray sets OMP_NUM_THREADS, for PyTorch
+        os.environ.update(self.variables)
+        if self.folder.is_dir():
+            os.chdir(self.folder)
+
+
+@dataclass(frozen=True)
+class UnitContext:
+    """What a machine must know to do units."""
 
     work: Path
     store: str | None  # URL
     tracks: Mapping[str, str]  # fingerprints by name
-    surroundings: Surroundings
+    environment: WorkerEnvironment
 
 
-class _Progress:
-    """Of a unit that is done here: the board hears of it, and says when to interrupt the work."""
+class _Reporter:
+    """Reports the progress of a unit to the actor."""
 
-    def __init__(self, unit: Unit, board: Any) -> None:
-        self.share = 0.0
-        self.work = Interruptible()
-        self._key, self._board, self._over = unit.key, board, threading.Event()
+    def __init__(self, unit: Unit, actor: Any) -> None:
+        self._key, self._actor, self._next = unit.key, actor, 0.0
 
-    @contextmanager
-    def on_board(self) -> Iterator[None]:
-        """All that Ctrl-C waits for, work or not. Raises KeyboardInterrupt where units are to stop already."""
-        if self._tell(patience=0.0):
-            raise KeyboardInterrupt
-        threading.Thread(target=self._watch, daemon=True).start()
-        try:
-            yield
-        finally:
-            self._over.set()
-
-    def note(self, share: float) -> None:
-        """So much is done."""
-        self.share = share
-
-    def _watch(self) -> None:
-        while not self._over.is_set():
-            if self._tell(REPORT_EVERY):
-                self.work.interrupt()
-                self._over.wait()  # until what it has done is saved
-        self._board.leave.remote(self._key)
-
-    def _tell(self, patience: float) -> bool:
-        """How far it is; whether it is to stop, see `_Board.report`."""
+    def __call__(self, share: float) -> None:
+        """Report, unless it was a moment ago. Raise KeyboardInterrupt if the unit is to stop."""
         import ray
         from ray.exceptions import RayError
 
+        if time.monotonic() < self._next:
+            return
+        self._next = time.monotonic() + REPORT_INTERVAL
         try:
-            return ray.get(self._board.report.remote(self._key, self.share, patience), timeout=10.0)
-        except RayError:  # on its way to another machine: nobody says to stop
-            self._over.wait(patience)
-            return False
+            stop = ray.get(self._actor.report.remote(self._key, share), timeout=10.0)
+        except RayError:  # it restarts on another machine
+            return
+        if stop:
+            raise KeyboardInterrupt
+
+    def leave(self) -> None:
+        """Have the actor forget the unit."""
+        self._actor.leave.remote(self._key)
 
 
-def _do_there(unit: Unit, orders: _Orders, board: Any) -> float | None:
-    """Do a unit on whatever machine this is; None where it was stopped."""
-    orders.surroundings.settle_in()
-    if unit.learns:
-        import_learning()  # before it is on the board: nobody waits for what has not begun
-    progress = _Progress(unit, board)
+def _run_on_node(unit: Unit, context: UnitContext, actor: Any) -> float | None:
+    """Do a unit on the machine of this process; return its seconds, or None if it was stopped."""
+    context.environment.apply()
+    report = _Reporter(unit, actor)
     try:
-        with progress.on_board():
-            if orders.store is None:
-                return _do_in_common_folder(unit, orders, progress)
-            with tempfile.TemporaryDirectory(prefix="outlap-") as scratch:
-                return _do_with_store(unit, orders, Path(scratch), Store(orders.store), progress)
+        _check_tracks(unit, context.tracks)
+        if context.store is None:
+            if not (context.work / ".lock").is_file():  # of the process that submits the units
+                raise OutlapError(
+                    f"{context.work}: is not seen by machine {os.uname().nodename}; give an --out that is, or a --store"
+                )
+            return run_unit(unit, context.work, report)
+        with tempfile.TemporaryDirectory(prefix="outlap-") as scratch:
+            return run_with_store(unit, Path(scratch), Store(context.store), report)
     except KeyboardInterrupt:
         return None
+    finally:
+        report.leave()
 
 
-def _do_in_common_folder(unit: Unit, orders: _Orders, progress: _Progress) -> float:
-    work, machine = orders.work, os.uname().nodename
-    if not (work / ".lock").is_file():  # of the process that hands out the units
-        raise OutlapError(f"{work}: is not seen by machine {machine}; give an --out that is, or a --store")
-    with progress.work.at_work():
-        _check_tracks(unit, orders.tracks)
-        return do_unit(unit, work, progress.note)
+def run_with_store(unit: Unit, scratch: Path, store: Store, report: Report) -> float:
+    """Do a unit in a scratch folder, and keep it in the store; an unfinished one is copied there regularly."""
+    copied = time.monotonic()
 
-
-def _do_with_store(unit: Unit, orders: _Orders, scratch: Path, store: Store, progress: _Progress) -> float:
-    keep = _now_and_then(STORE_EVERY, lambda: _keep_part(unit, scratch, store))
-
-    def report(share: float) -> None:
-        progress.note(share)
-        keep()
-
-    try:
-        with progress.work.at_work():
-            _check_tracks(unit, orders.tracks)
-            for needed in {each.key: each for each in _all_needs(unit)}.values():
-                store.get(needed, scratch)
-            store.get_part(unit, scratch)
-            seconds = do_unit(unit, scratch, report)
-    except KeyboardInterrupt:
-        if unit.folder(scratch).is_dir():  # else what the store has of it is not here yet
+    def report_and_copy(share: float) -> None:
+        nonlocal copied
+        report(share)
+        if time.monotonic() - copied < STORE_INTERVAL:
+            return
+        try:
             store.put_part(unit, scratch)
+        except Exception as error:  # each file system has errors of its own; the next copy may succeed
+            log.warning("%s: goes on, and is not copied to %s: %s", unit.name, store.url, error)
+        copied = time.monotonic()
+
+    for needed in {each.key: each for each in unit.all_needs()}.values():
+        store.get(needed, scratch)
+    store.get_part(unit, scratch)
+    try:
+        seconds = run_unit(unit, scratch, report_and_copy)
+    except KeyboardInterrupt:
+        store.put_part(unit, scratch)
         raise
     store.put(unit, scratch)
     return seconds
 
 
-def _keep_part(unit: Unit, scratch: Path, store: Store) -> None:
-    try:
-        store.put_part(unit, scratch)
-    except Exception as error:  # whatever its file system raises; the next copy may succeed
-        log.warning("%s: goes on, and is not copied to %s: %s", unit.name, store.url, error)
-
-
-def _all_needs(unit: Unit) -> Iterable[Unit]:
-    for needed in unit.needs:
-        yield from _all_needs(needed)
-        yield needed
-
-
-def _now_and_then(seconds: float, act: Callable[[], None]) -> Callable[[], None]:
-    """What acts when it is called, but so often at most."""
-    last = time.monotonic()
-
-    def sometimes() -> None:
-        nonlocal last
-        if time.monotonic() - last >= seconds:
-            act()
-            last = time.monotonic()
-
-    return sometimes
-
-
 def _check_tracks(unit: Unit, fingerprints: Mapping[str, str]) -> None:
-    """Raises OutlapError for a track that is another one here than where the work was planned."""
+    """Raise OutlapError if a track differs from that of the machine that gave the command."""
     from outlap.track.catalog import load_track
 
     for name in unit.tracks:

@@ -1,12 +1,14 @@
-"""Doing units of work on an engine: each when what it needs is done, and none twice.
+"""Do units of work on an engine, in order of their requirements, each once.
 
-Killed at any moment, the same units go on where they were. A unit that fails stops only those that need it.
+A killed command resumes by running again. A failed unit stops only the units that need it.
 """
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +16,13 @@ from filelock import FileLock, Timeout
 
 from outlap.errors import OutlapError
 from outlap.experiments.engine import Engine, LocalEngine
-from outlap.experiments.unit import Unit, done_record
+from outlap.experiments.unit import DONE, Unit
 
 log = logging.getLogger(__name__)
 
-POLL = 0.5  # [s] between two looks at how far units are
+POLL_INTERVAL = 0.5  # [s] between two status reports
+
+OnDone = Callable[[Unit], Sequence[Unit]]
 
 
 @dataclass(frozen=True)
@@ -27,9 +31,8 @@ class Status:
 
     units: int
     done: int
-    work: float  # [s] all units together, as they were estimated
-    work_done: float
-    seconds_left: float
+    share: float  # of the units, with the finished shares of those that run
+    seconds_left: float | None  # None: unknown until a unit of each category has finished
     running: tuple[str, ...]
 
 
@@ -38,96 +41,137 @@ def run_units(
     work: Path,
     engine: Engine | None = None,
     on_status: Callable[[Status], None] | None = None,
+    on_done: OnDone | None = None,
 ) -> None:
     """Do all units that are not done yet.
 
     Args:
-        units: none before those that it needs.
-        work: the folder for their folders.
-        engine: what does them; by default one unit a core of this machine. It is closed at the end.
-        on_status: called now and then.
+        units: each after those that it needs.
+        work: the folder of their folders.
+        engine: what does them, by default one unit on each core of this machine. It is closed at the end.
+        on_status: called repeatedly.
+        on_done: called once with each finished unit, earlier sessions included; returns units to do next.
 
-    Raises OutlapError that names the units that failed, once all the others are done. A KeyboardInterrupt passes
-    through once every running unit has saved what it has.
+    Raises OutlapError that names the units that failed, after all others are done. A KeyboardInterrupt passes through
+    after every running unit has saved its work.
     """
     work.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(work / ".lock", timeout=0):
-            _run_units(units, work, engine or LocalEngine(), on_status)
+            _Session(work, engine or LocalEngine(), on_done).run(units, on_status)
     except Timeout:
         raise OutlapError(f"{work}: another process is at work there; wait for it, or give another --out") from None
 
 
-def _run_units(units: Sequence[Unit], work: Path, engine: Engine, on_status: Callable[[Status], None] | None) -> None:
-    missing = [unit for unit in units if not unit.is_done(work)]
-    if not missing:
-        return
-    failed: dict[str, tuple[Unit, str]] = {}  # by key, with the reason
-    running: dict[str, Unit] = {}
-    try:
-        engine.open(missing, work)  # which may find some of them done elsewhere
-        pace = _Pace(units, work)
-        done = {unit.key for unit in units if unit.is_done(work)}
-        waiting = [unit for unit in missing if unit.key not in done]
-        while waiting or running:
-            for unit in list(waiting):
-                if len(running) >= engine.limit:
-                    break
-                if any(needed.key in failed for needed in unit.needs):
-                    waiting.remove(unit)
-                    failed[unit.key] = unit, "needs one that failed"
-                elif all(needed.key in done for needed in unit.needs):
-                    waiting.remove(unit)
-                    running[unit.key] = unit
-                    engine.submit(unit)
-            if not running:
-                continue
-            for outcome in engine.wait(POLL):
-                unit = running.pop(outcome.unit.key)
-                if outcome.error is None:
-                    done.add(unit.key)
-                    pace.note(unit, outcome.seconds)
-                else:
-                    log.warning("%s failed: %s", unit.name, outcome.error)
-                    failed[unit.key] = unit, f"{type(outcome.error).__name__}: {outcome.error}"
-            if on_status is not None:
-                on_status(pace.status(len(done), engine.shares(), [*running.values(), *waiting], engine.slots))
-    finally:
-        engine.close()  # after an error or Ctrl-C, units that still run save and go
-    if failed:
-        unit, reason = next(iter(failed.values()))
-        raise OutlapError(
-            f"{len(failed)} of {len(units)} units of work failed, {unit.name} first ({reason}); what is done is kept: "
-            "the same command tries again, and other --methods or tables go without it"
-        )
+class _Session:
+    """One call of `run_units`."""
+
+    def __init__(self, work: Path, engine: Engine, on_done: OnDone | None) -> None:
+        self._work, self._engine, self._on_done = work, engine, on_done
+        self._units: dict[str, Unit] = {}  # all of them, by key, as below
+        self._done: set[str] = set()
+        self._waiting: list[Unit] = []
+        self._running: dict[str, Unit] = {}
+        self._failed: dict[str, str] = {}  # reasons
+        self._rates: dict[str, float] = {}
+        self._rated = -1  # units that were done at that time
+
+    def run(self, units: Sequence[Unit], on_status: Callable[[Status], None] | None) -> None:
+        if self._on_done is None and all(unit.is_done(self._work) for unit in units):
+            return
+        try:
+            self._engine.open(self._work)
+            self._add(units)
+            while self._waiting or self._running:
+                self._submit()
+                if not self._running:
+                    continue
+                for outcome in self._engine.wait(POLL_INTERVAL):
+                    unit = self._running.pop(outcome.unit.key)
+                    if outcome.error is None:
+                        self._finish(unit)
+                    else:
+                        log.warning("%s failed: %s", unit.name, outcome.error)
+                        self._failed[unit.key] = f"{type(outcome.error).__name__}: {outcome.error}"
+                if on_status is not None:
+                    on_status(self._status())
+        finally:
+            self._engine.close()
+        if self._failed:
+            key, reason = next(iter(self._failed.items()))
+            raise OutlapError(
+                f"{len(self._failed)} of {len(self._units)} units of work failed, {self._units[key].name} first "
+                f"({reason}); what is done is kept: the same command tries again, and other --methods or tables go "
+                "without it"
+            )
+
+    def _add(self, units: Sequence[Unit]) -> None:
+        new = {unit.key: unit for unit in units if unit.key not in self._units}
+        self._units |= new
+        self._engine.fetch([unit for unit in new.values() if not unit.is_done(self._work)])
+        done = [unit for unit in new.values() if unit.is_done(self._work)]
+        self._waiting += [unit for unit in new.values() if unit not in done]
+        for unit in done:
+            self._finish(unit)
+
+    def _finish(self, unit: Unit) -> None:
+        self._done.add(unit.key)
+        if self._on_done is not None:
+            self._add(self._on_done(unit))
+
+    def _submit(self) -> None:
+        """Submit units that can begin."""
+        for unit in list(self._waiting):
+            if len(self._running) >= self._engine.limit:
+                break
+            if any(needed.key in self._failed for needed in unit.needs):
+                self._waiting.remove(unit)
+                self._failed[unit.key] = "needs one that failed"
+            elif all(needed.key in self._done for needed in unit.needs):
+                self._waiting.remove(unit)
+                self._running[unit.key] = unit
+                self._engine.submit(unit)
+
+    def _status(self) -> Status:
+        shares = self._engine.shares()
+        if len(self._done) != self._rated:
+            self._rates, self._rated = finished_rates(self._work), len(self._done)
+        unfinished = [*self._running.values(), *self._waiting]
+        seconds = estimate_seconds(unfinished, self._rates, self._engine.slots, shares)
+        names = tuple(sorted(unit.name for unit in self._running.values() if unit.key in shares))
+        share = (len(self._done) + sum(shares.get(key, 0.0) for key in self._running)) / len(self._units)
+        return Status(len(self._units), len(self._done), share, seconds, names)
 
 
-class _Pace:
-    """How long units take, from estimates that are corrected by the units of the same kind that are done."""
+def finished_rates(work: Path) -> dict[str, float]:
+    """Return the mean seconds for a size of one that the finished units of a work folder took, by category."""
+    totals: dict[str, list[float]] = {}
+    for path in work.glob(f"*/*/{DONE}"):
+        with suppress(OSError, ValueError, KeyError):
+            record = json.loads(path.read_text())
+            total = totals.setdefault(record["category"], [0.0, 0.0])
+            total[0] += float(record["seconds"])
+            total[1] += float(record["size"])
+    return {category: seconds / max(size, 1e-9) for category, (seconds, size) in totals.items()}
 
-    def __init__(self, units: Sequence[Unit], work: Path) -> None:
-        self.units = units
-        self.ratios: dict[str, list[tuple[float, float]]] = {}
-        for unit in units:
-            if unit.is_done(work):
-                self.note(unit, float(done_record(unit, work).get("seconds", unit.seconds)))
 
-    def note(self, unit: Unit, seconds: float) -> None:
-        """A unit took so long."""
-        self.ratios.setdefault(unit.kind, []).append((seconds, unit.seconds))
+def estimate_seconds(
+    units: Iterable[Unit], rates: Mapping[str, float], slots: int, shares: Mapping[str, float]
+) -> float | None:
+    """Estimate how long units take.
 
-    def expected(self, unit: Unit) -> float:
-        """[s] that a unit should take."""
-        known = self.ratios.get(unit.kind, [])
-        # One unit's worth of the estimate itself, so that the first one that is done does not decide alone.
-        taken = sum(seconds for seconds, _ in known) + unit.seconds
-        return unit.seconds * taken / (sum(estimate for _, estimate in known) + unit.seconds)
+    Args:
+        units: those that are not done.
+        rates: see `finished_rates`.
+        slots: units at a time.
+        shares: finished shares of units that run, by key.
 
-    def status(self, done: int, shares: Mapping[str, float], to_do: Sequence[Unit], slots: int) -> Status:
-        """Where things stand, with the shares that are done of those units that run, by their keys."""
-        left = [self.expected(unit) * (1.0 - shares.get(unit.key, 0.0)) for unit in to_do]
-        total = sum(self.expected(unit) for unit in self.units)
-        # Where few units are left, not all slots have work.
-        seconds = max(sum(left) / slots, max(left, default=0.0))
-        names = tuple(sorted(unit.name for unit in to_do if unit.key in shares))
-        return Status(len(self.units), done, total, total - sum(left), seconds, names)
+    Returns:
+        Seconds; None if no unit of a category has finished.
+    """
+    left = []
+    for unit in units:
+        if unit.category not in rates:
+            return None
+        left.append(unit.size * rates[unit.category] * (1.0 - shares.get(unit.key, 0.0)))
+    return max(sum(left) / slots, max(left, default=0.0))  # the last units do not fill all slots

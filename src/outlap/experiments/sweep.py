@@ -28,7 +28,7 @@ from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS
 from outlap.experiments.definitions import merge
 from outlap.experiments.plan import PAPER_REWARD, training_class
-from outlap.experiments.units import RaceUnit, Task, TrainingUnit
+from outlap.experiments.paper_units import RaceUnit, Task, TrainingUnit
 from outlap.files import to_json
 from outlap.track.generate import BUILTIN_TRAIN
 from outlap.training.session import TrainingConfig

@@ -1,14 +1,14 @@
-"""A unit of work: a folder, written once and used again by everything that needs it.
+"""A unit of work: a folder, written once and reused by everything that needs it.
 
-Its folder is named by a hash of what the unit is made of, the units that it needs included: whatever changes gets a
-new folder, and nothing else is done again. A unit is done when its `done.json` is there.
+A hash of the unit's fields, including the units that it needs, names the folder. A changed field therefore gets a new
+folder, and everything else is reused. A unit is done when its `done.json` exists.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -16,44 +16,57 @@ from typing import Any, ClassVar
 
 from outlap.files import to_json
 
-VERSION = 1  # of what units write; another one does everything again
+VERSION = 1  # of the files that units write; a new version repeats all work
 DONE = "done.json"
-Report = Callable[[float], None]  # called with the share that is done, now and then
+Report = Callable[[float], None]  # takes the finished share of a unit, 0 … 1; raises KeyboardInterrupt to stop it
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """A piece of work. Fields say what it is made of; those that are units are what it needs."""
+    """A piece of work.
+
+    The fields identify it. Fields that hold units are its requirements; a field with `compare=False`, such as the
+    place of an input on this machine, does not enter the hash.
+    """
 
     name: str
     kind: ClassVar[str]
-    # Whether it needs PyTorch, which is imported before it begins: a process can be ended at once meanwhile.
-    learns: ClassVar[bool] = True
 
     @cached_property
     def needs(self) -> tuple[Unit, ...]:
-        """Units that must be done before."""
+        """Units that must be done first."""
         found: list[Unit] = []
         for each in fields(self):
             value = getattr(self, each.name)
             found += [one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Unit)]
         return tuple(found)
 
+    def all_needs(self) -> Iterator[Unit]:
+        """Units that must be done first, each after its own requirements."""
+        for needed in self.needs:
+            yield from needed.all_needs()
+            yield needed
+
     @cached_property
     def key(self) -> str:
-        """The hash."""
-        made_of: dict[str, Any] = {"version": VERSION, "kind": self.kind, "needs": [unit.key for unit in self.needs]}
+        """The hash that identifies the unit, 12 hexadecimal digits."""
+        content: dict[str, Any] = {"version": VERSION, "kind": self.kind, "needs": [unit.key for unit in self.needs]}
         for each in fields(self):
             value = getattr(self, each.name)
             needed = isinstance(value, Unit) or (isinstance(value, tuple) and any(isinstance(v, Unit) for v in value))
-            if not needed:
-                made_of[each.name] = value
-        return hashlib.sha256(to_json(made_of).encode()).hexdigest()[:12]
+            if each.compare and not needed:
+                content[each.name] = value
+        return hashlib.sha256(to_json(content).encode()).hexdigest()[:12]
 
     @property
-    def seconds(self) -> float:
-        """About how long it takes on one core."""
-        raise NotImplementedError
+    def category(self) -> str:
+        """Units of one category take time in proportion to their size."""
+        return self.kind
+
+    @property
+    def size(self) -> float:
+        """Amount of work, in any measure that the units of a category share."""
+        return 1.0
 
     @property
     def tracks(self) -> tuple[str, ...]:
@@ -62,22 +75,22 @@ class Unit:
 
     @property
     def uses_gpu(self) -> bool:
-        """Whether it needs a share of one."""
+        """Whether it needs a share of a GPU."""
         return False
 
     def folder(self, work: Path) -> Path:
-        """Where it is, in a folder of work."""
+        """Return its folder in a work folder."""
         return work / self.kind / f"{self.name}-{self.key}"
 
     def is_done(self, work: Path) -> bool:
-        """Whether nothing is left to do."""
+        """Return whether it is finished."""
         return (self.folder(work) / DONE).is_file()
 
     def do(self, work: Path, report: Report) -> None:
-        """Do it, or go on with it, in its folder. Raises KeyboardInterrupt where `report` does, its work saved."""
+        """Do the work in its folder, or resume it. Raise KeyboardInterrupt if `report` does, with the work saved."""
         raise NotImplementedError
 
 
 def done_record(unit: Unit, work: Path) -> dict[str, Any]:
-    """What was noted when a unit was done."""
+    """Return the content of a finished unit's `done.json`."""
     return json.loads((unit.folder(work) / DONE).read_text())

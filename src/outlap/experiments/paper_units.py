@@ -16,10 +16,9 @@ from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.definitions import changed
-from outlap.experiments.population import PopulationUnit
+from outlap.experiments.opponent_units import PopulationUnit
 from outlap.experiments.unit import Report, Unit
 from outlap.training.mql import MQLConfig, load_meta
-from outlap.training.ppo import PPOConfig
 from outlap.training.session import TrainingConfig
 
 if TYPE_CHECKING:
@@ -49,18 +48,12 @@ class TrainingUnit(Unit):
         return self.config.device.startswith("cuda")
 
     @property
-    def seconds(self) -> float:
-        config = self.config
-        rate = {"ppo": 11_000, "recurrent-ppo": 3_500}.get(config.algorithm, 30_000)  # actions a second
-        beams = (1.0 + config.env.beams / 540) * (1.5 if config.env.num_cars > 1 else 1.0)
-        seconds = config.total_steps / rate * beams / 1.2
-        if isinstance(config, MQLConfig):
-            updates = config.total_steps / config.num_envs * config.updates_per_step * config.batch_size / 256
-            each = {"fast": 0.027, "paper": 0.12}[config.preset] * (1.0 if config.uses_context else 0.65)
-            seconds += updates * each
-        elif isinstance(config, PPOConfig):  # many small batches cost more than few large ones
-            seconds += config.total_steps / config.batch_size * config.n_epochs * 0.003
-        return 2.0 + seconds
+    def category(self) -> str:
+        return f"{self.kind}/{self.config.algorithm}"
+
+    @property
+    def size(self) -> float:
+        return self.config.total_steps
 
     def do(self, work: Path, report: Report) -> None:
         from outlap.training.run import load_run
@@ -133,13 +126,12 @@ class RaceUnit(Unit):
         return self.adaptation is not None and self.training is not None and self.training.uses_gpu
 
     @property
-    def seconds(self) -> float:
-        steps = len(self.tasks) * self.episodes * self.time_limit / 0.04
-        each = 0.4
-        if self.adaptation is not None:
-            settings = adaptation_settings(self.adaptation)
-            each += 0.5 + _seconds_of_adaptation(settings) + 0.004 * settings.iterations * settings.collect_steps
-        return 1.0 + steps / 8_000 * (1.5 if self.env.num_cars > 1 else 1.0) + each * len(self.tasks)
+    def category(self) -> str:
+        return f"{self.kind}/{'adapted' if self.adaptation is not None else 'not adapted'}"
+
+    @property
+    def size(self) -> float:
+        return len(self.tasks) * self.episodes * self.time_limit
 
     def do(self, work: Path, report: Report) -> None:
         from outlap.evaluation.rollout import EvaluationProgress, evaluate, standing_starts
@@ -206,10 +198,6 @@ class ClippingUnit(Unit):
     def uses_gpu(self) -> bool:
         return self.training.uses_gpu
 
-    @property
-    def seconds(self) -> float:
-        return 5.0 + 3 * _seconds_of_adaptation(adaptation_settings({"clip": "abc", **self.settings}))
-
     def do(self, work: Path, report: Report) -> None:
         from outlap.experiments.clipping import compare_rules
         from outlap.mql.adaptation import collect
@@ -222,12 +210,6 @@ class ClippingUnit(Unit):
         facts = {"seed": self.seed, "adaptation_seed": self.adaptation_seed, "task": self.task.name}
         for name, rows in found.items():
             write_rows(rows.assign(**facts), self.folder(work) / f"{name}.parquet")
-
-
-def _seconds_of_adaptation(settings: AdaptationSettings) -> float:
-    """About how long its updates take."""
-    updates = settings.iterations * (settings.on_task_steps + settings.replay_steps)
-    return 0.025 * updates * settings.batch_size / 256
 
 
 def collecting(unit: TrainingUnit, task: Task, work: Path, seed: int):

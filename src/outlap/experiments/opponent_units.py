@@ -34,8 +34,8 @@ class OpponentUnit(Unit):
     starts: int = 20
 
     @property
-    def seconds(self) -> float:
-        return 5.0 + self.settings.total_steps / 11_000
+    def size(self) -> float:
+        return self.settings.total_steps
 
     @property
     def tracks(self) -> tuple[str, ...]:
@@ -69,12 +69,7 @@ class PopulationUnit(Unit):
     """The opponents that passed their verification, as a population."""
 
     kind = "populations"
-    learns = False
     opponents: tuple[OpponentUnit, ...]
-
-    @property
-    def seconds(self) -> float:
-        return 1.0
 
     def do(self, work: Path, report: Report) -> None:
         passed = [unit for unit, _, member in enter_all(self.opponents, work, self.folder(work), COMMAND) if member]
