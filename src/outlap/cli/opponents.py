@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import Command, LongCommand
 from outlap.cli.output import CommandResult
-from outlap.cli.progress import progress_bar
-from outlap.cli.work import WorkFlags
+from outlap.cli.work import WorkCommand
 from outlap.drivers.population import Split, load_population, read_manifest
 from outlap.errors import OutlapError
 from outlap.training.population import opponent_defaults
@@ -29,11 +29,9 @@ if TYPE_CHECKING:
 
     from outlap.training.population import Opponent
 
-Flag = FlagCreatePairsOff[bool]
-
 
 @dataclass(frozen=True)
-class TrainOpponents(WorkFlags):
+class TrainOpponents(WorkCommand):
     """Train a population of opponents: one PPO policy for every top speed, verified before it may race.
 
     A population that was stopped goes on with the same command.
@@ -59,12 +57,6 @@ class TrainOpponents(WorkFlags):
     starts: int = 20
     """Of its verification."""
 
-    quiet: Flag = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         from outlap.experiments.opponent_units import OpponentUnit, enter_all
         from outlap.track import load_track
@@ -79,7 +71,7 @@ class TrainOpponents(WorkFlags):
             OpponentUnit(each.name, self.settings, self.track, each.max_speed_mps, each.split, self.laps, self.starts)
             for each in opponents
         ]
-        self.do_units(units, folder / "work", "training", self.quiet)
+        self.do_units(units, folder / "work", "training")
         command = shlex.join(["outlap", *sys.argv[1:]])
         entered = enter_all(units, folder / "work", folder, command)
         rows = [_row(unit.opponent, found, member is not None) for unit, found, member in entered]
@@ -88,7 +80,7 @@ class TrainOpponents(WorkFlags):
 
 
 @dataclass(frozen=True)
-class RecordLap:
+class RecordLap(Command):
     """Record a flying lap of a driver alone; the file is an opponent (a ghost) for that track."""
 
     driver: Annotated[Positional[str], arg(metavar="RUN")]
@@ -105,9 +97,6 @@ class RecordLap:
 
     seed: int = 0
     """Of the start."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.cli.races import find_subject, with_top_speed
@@ -130,20 +119,17 @@ class RecordLap:
         return CommandResult(
             data,
             lambda console: console.print(
-                f"{lap[-1, 0]:.2f} s, {len(lap)} points: {path}", highlight=False, markup=False, soft_wrap=True
+                f"{lap[-1, 0]:.2f} s, {len(lap)} points: {path}"
             ),
         )
 
 
 @dataclass(frozen=True)
-class ListOpponents:
+class ListOpponents(Command):
     """List the opponents of a population."""
 
     folder: Annotated[Positional[Path | None], arg(metavar="FOLDER")] = None
     """The population; by default the one that comes with outlap."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.drivers.population import SHIPPED
@@ -186,7 +172,7 @@ def _span(text: str) -> list[float]:
 
 
 @dataclass(frozen=True)
-class VerifyOpponents:
+class VerifyOpponents(LongCommand):
     """Race every opponent of a population alone again, and take those that fail out of its manifest."""
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -198,12 +184,6 @@ class VerifyOpponents:
     starts: int = 20
     """Standing starts anywhere on the lap."""
 
-    quiet: Flag = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
-
     def run(self) -> CommandResult:
         from outlap.track import load_track
         from outlap.training.population import Opponent, enter, verify
@@ -213,7 +193,7 @@ class VerifyOpponents:
         members = {member.name: member for member in read_manifest(self.folder)}
         drivers = load_population(self.folder, split=None)
         rows = []
-        with progress_bar("verifying", len(drivers), "opponents", self.quiet) as update:
+        with self.progress("verifying", len(drivers), "opponents") as update:
             for driver in drivers:
                 member = members[driver.name]
                 track = load_track(member.track)
@@ -257,4 +237,4 @@ def _print(console: Console, rows: Sequence[dict[str, Any]], folder: Path) -> No
             f"{row['crash_rate']:.0%}", lap_time, failed,
         )  # fmt: skip
     console.print(table)
-    console.print(f"population: {folder}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"population: {folder}")

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
+from outlap.cli.command import Flag
 from outlap.cli.output import CommandResult
-from outlap.cli.work import WorkFlags, duration
+from outlap.cli.work import WorkCommand, duration
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,7 +26,7 @@ SHOWN = {"overtakes": "overtakes in 500", "crashes": "crashes in 500", "progress
 
 
 @dataclass(frozen=True)
-class Reproduce(WorkFlags):
+class Reproduce(WorkCommand):
     """Make the paper's tables and figures: train what is missing, adapt, race, and write a report.
 
     Whatever is done is kept in --out: the same command goes on after a kill, and a changed configuration does anew
@@ -47,17 +48,11 @@ class Reproduce(WorkFlags):
     out: Path | None = None
     """The folder for the report and the work; by default runs/reproduce-BUDGET."""
 
-    driver_code: FlagCreatePairsOff[bool] = False
+    driver_code: Flag = False
     """Import modules that a method's file names as its driver, module:function, which runs their code."""
 
-    dry_run: FlagCreatePairsOff[bool] = False
+    dry_run: Flag = False
     """Say what there is to do, and do nothing."""
-
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.experiments.plan import make_plan
@@ -70,7 +65,7 @@ class Reproduce(WorkFlags):
         work = folder / "work"
         if self.dry_run:
             return _dry_run(plan.units, work, self.jobs or os.cpu_count() or 1)
-        self.do_units(plan.units, work, "reproducing", self.quiet)
+        self.do_units(plan.units, work, "reproducing")
         data = write_report(plan, folder)
         return CommandResult({**data, "folder": folder}, lambda console: _print(console, data, folder))
 
@@ -95,9 +90,9 @@ def _dry_run(units: Sequence[Unit], work: Path, slots: int) -> CommandResult:
 
     def show(console: Console) -> None:
         for kind, count in counts.items():
-            console.print(f"{count:5} {kind}", highlight=False)
+            console.print(f"{count:5} {kind}")
         about = "" if seconds is None else f"about {duration(seconds)}; "
-        console.print(f"{about}{len(units) - len(missing)} of {len(units)} are done", highlight=False)
+        console.print(f"{about}{len(units) - len(missing)} of {len(units)} are done")
 
     return CommandResult(data, show)
 
@@ -117,5 +112,5 @@ def _print(console: Console, data: Mapping[str, Any], folder: Path) -> None:
         for method, row in methods.items():
             table.add_row(Text(method), *(_cell(row[metric]) for metric in metrics))
         console.print(table)
-    console.print("mean over seeds [95 % interval], (the paper)", style="dim", highlight=False, markup=False)
-    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+    console.print("mean over seeds [95 % interval], (the paper)", style="dim")
+    console.print(f"report: {folder / 'report.html'}")

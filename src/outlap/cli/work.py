@@ -1,30 +1,33 @@
-"""Flags of commands that do many units of work, and the units done with progress."""
+"""Commands that do units of work: their flags, and the units done with progress."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from outlap.cli.arguments import check_least
-from outlap.cli.progress import progress_bar
+from outlap.cli.command import LongCommand
 from outlap.errors import OutlapError
 from outlap.files import make_folder
 
 if TYPE_CHECKING:
     from outlap.experiments.engine import Engine
-    from outlap.experiments.runner import Status
+    from outlap.experiments.runner import OnDone, Status
     from outlap.experiments.unit import Unit
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClusterFlags:
-    """How much is at work, and where."""
+class WorkCommand(LongCommand):
+    """A command that does units of work, on this machine or on a Ray cluster."""
 
     jobs: int = 0
     """Units of work at a time; 0: one a core."""
+
+    engine: Literal["local", "ray"] = "local"
+    """Processes of this machine, or a Ray cluster."""
 
     address: str | None = None
     """Of a Ray cluster's head; by default RAY_ADDRESS, or else a cluster of this machine alone."""
@@ -36,28 +39,45 @@ class ClusterFlags:
     """Of a GPU, for each training on one (device cuda) that Ray does."""
 
     def check_flags(self) -> None:
-        """Raises OutlapError for a flag that is wrong."""
+        """Raise OutlapError for a wrong flag."""
         check_least("--jobs", self.jobs, 0)
         if not 0.0 < self.gpu_share <= 1.0:
             raise OutlapError(f"--gpu-share is {self.gpu_share}; must be > 0 and at most 1")
+        for flag, value in (("--address", self.address), ("--store", self.store)):
+            if self.engine == "local" and value is not None:
+                raise OutlapError(f"{flag} is of the engine ray alone; add --engine ray, or leave it out")
 
+    def do_units(
+        self,
+        units: Sequence[Unit],
+        work: Path,
+        title: str,
+        on_done: OnDone | None = None,
+        tracks: Iterable[str] = (),
+        resume: str = "go on with the same command",
+    ) -> None:
+        """Do units with a progress bar, see `run_units`; after Ctrl-C say how to resume.
 
-@dataclass(frozen=True, kw_only=True)
-class WorkFlags(ClusterFlags):
-    """On what units of work are done."""
+        Args:
+            units: see `run_units`, as `work` and `on_done`.
+            title: of the progress bar.
+            tracks: names of tracks that only units use which follow from others.
+            resume: how, in words.
+        """
+        from outlap.experiments.plan import remember_tracks
+        from outlap.experiments.runner import run_units
 
-    engine: Literal["local", "ray"] = "local"
-    """Processes of this machine, or a Ray cluster."""
+        make_folder(work)
+        engine = self._make_engine(remember_tracks({*tracks, *(name for unit in units for name in unit.tracks)}, work))
+        with self.progress(title, 1000, "‰") as update:
+            try:
+                run_units(units, work, engine, lambda status: update(round(1000 * status.share), _note(status)), on_done)
+            except KeyboardInterrupt:
+                print(f"\nsaved; {resume}", file=sys.stderr)
+                raise
 
-    def check_flags(self) -> None:
-        super().check_flags()
-        if self.engine == "local":
-            for flag, value in (("--address", self.address), ("--store", self.store)):
-                if value is not None:
-                    raise OutlapError(f"{flag} is of the engine ray alone; add --engine ray, or leave it out")
-
-    def make_engine(self, tracks: Mapping[str, str]) -> Engine:
-        """The engine; on other machines tracks must have these fingerprints."""
+    def _make_engine(self, tracks: Mapping[str, str]) -> Engine:
+        """Return the engine; on other machines tracks must have these fingerprints."""
         from outlap.experiments.engine import LocalEngine
 
         if self.engine == "local":
@@ -66,30 +86,16 @@ class WorkFlags(ClusterFlags):
 
         return RayEngine(self.address, self.store, self.jobs, self.gpu_share, tracks)
 
-    def do_units(self, units: Sequence[Unit], work: Path, title: str, quiet: bool) -> None:
-        """Do units with a progress bar; after Ctrl-C say how to go on."""
-        from outlap.experiments.plan import remember_tracks
-        from outlap.experiments.runner import run_units
 
-        make_folder(work)
-        engine = self.make_engine(remember_tracks({name for unit in units for name in unit.tracks}, work))
-        with progress_bar(title, 1000, "‰", quiet) as update:
-
-            def show(status: Status) -> None:
-                note = f"{status.done} of {status.units} units"
-                if status.running:
-                    left = "estimating" if status.seconds_left is None else f"{duration(status.seconds_left)} left"
-                    note += f", {left}: {', '.join(status.running)}"
-                update(round(1000 * status.share), note)
-
-            try:
-                run_units(units, work, engine, show)
-            except KeyboardInterrupt:
-                print("\nsaved; go on with the same command", file=sys.stderr)
-                raise
+def _note(status: Status) -> str:
+    note = f"{status.done} of {status.units} units"
+    if status.running:
+        left = "estimating" if status.seconds_left is None else f"{duration(status.seconds_left)} left"
+        note += f", {left}: {', '.join(status.running)}"
+    return note
 
 
 def duration(seconds: float) -> str:
-    """In hours and minutes, for a person."""
+    """Return a duration in hours and minutes, for a person."""
     minutes = round(seconds / 60.0)
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{max(minutes, 1)} min"

@@ -1,197 +1,312 @@
-"""A sweep by Ray Tune: trials that fall behind are stopped early (ASHA), those that are promising go to their end."""
+"""Search for hyper-parameters with Optuna; trials are trained and raced as units of work, and may be stopped early."""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import json
-import os
+import hashlib
+import itertools
+import math
 import shutil
-import tempfile
-from collections.abc import Callable
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
+from outlap.config import save_config
+from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
-from outlap.experiments.ray_cluster import import_ray, ray_cluster
-from outlap.experiments.ray_engine import Surroundings
-from outlap.experiments.store import Store
-from outlap.experiments.sweep import SweepConfig
-from outlap.files import to_json
+from outlap.evaluation.results import ROWS
+from outlap.experiments.engine import SECONDS
+from outlap.experiments.paper_units import RaceUnit, Task, TrainingUnit
+from outlap.experiments.plan import PAPER_REWARD
+from outlap.experiments.search import Range, SearchConfig
+from outlap.experiments.unit import DONE, Report, Unit
+from outlap.files import atomic_write, make_folder, to_json
+from outlap.track.generate import BUILTIN_TRAIN
 from outlap.training.run import Run, load_run
-from outlap.training.session import Progress, train
+from outlap.training.session import Progress, TrainingConfig, TrainingDiverged, train
 
-SCORE = "progress_m"  # of a training's recent episodes
-RETRIES = 5  # of a trial whose process or machine is lost
-FIRST_CUT = 8  # trials are compared for the first time after this part of their steps
-STEPS = "steps"
-TRIAL = "trial"
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.trial import Trial as OptunaTrial
 
-OnTrials = Callable[[int, int], None]
-LISTENER: ContextVar[OnTrials | None] = ContextVar("LISTENER", default=None)  # of the search in this process
+DIVERGED = "diverged.txt"  # in the folder of a training that diverged, with the reason
 
 
-def tune_trials(
-    sweep: SweepConfig,
-    folder: Path,
-    address: str | None = None,
-    store: str | None = None,
-    jobs: int = 0,
-    gpu_share: float = 1.0,
-    on_trials: OnTrials | None = None,
-) -> pd.DataFrame:
-    """Search with Ray Tune; what was begun in the folder, or the store, goes on.
+class _RungReached(KeyboardInterrupt):
+    """Stops a training with a checkpoint, as Ctrl-C does."""
+
+
+@dataclass(frozen=True, eq=False)
+class RungUnit(TrainingUnit):
+    """A training up to some of its steps, from where the rung before ended."""
+
+    kind = "rungs"
+    steps: int = 0
+    previous: RungUnit | None = None
+
+    @property
+    def size(self) -> float:
+        return self.steps - self.first_step
+
+    @property
+    def first_step(self) -> int:
+        """Steps of the rung before."""
+        return self.previous.steps if self.previous else 0
+
+    def diverged(self, work: Path) -> bool:
+        """Return whether the training diverged, which ends the trial."""
+        return (self.folder(work) / DIVERGED).is_file()
+
+    def do(self, work: Path, report: Report) -> None:
+        folder = self.folder(work)
+        begun = self._begun(folder, work)
+
+        def on_progress(progress: Progress) -> None:
+            report(min(1.0, max(0.0, (progress.steps - self.first_step) / self.size)))
+            if self.steps <= progress.steps < progress.total_steps:
+                raise _RungReached
+
+        try:
+            if begun is None or not self._is_reached(begun):
+                train(self.config, folder, resume=begun, on_progress=on_progress)
+        except _RungReached:
+            pass
+        except TrainingDiverged as error:
+            atomic_write(folder / DIVERGED, f"{error}\n")
+
+    def _begun(self, folder: Path, work: Path) -> Run | None:
+        """Return the run to continue: that of this unit, or a copy of that of the rung before."""
+        if not (folder / "config.yaml").is_file():
+            if self.previous is None:
+                return None
+            unfinished = shutil.ignore_patterns(".*", DONE, SECONDS, "config.yaml")
+            shutil.copytree(self.previous.folder(work), folder, ignore=unfinished, dirs_exist_ok=True)
+            save_config(self.config, folder / "config.yaml")  # last: it marks a whole run
+        return load_run(folder)
+
+    def _is_reached(self, run: Run) -> bool:
+        steps = [int(path.stem.removeprefix("step_")) for path in run.checkpoints()]
+        return self.steps < self.config.total_steps and max(steps, default=0) >= self.steps
+
+
+@dataclass
+class Trial:
+    """Values to train with, and how far their trainings have come."""
+
+    number: int
+    values: Mapping[str, Any]
+    rungs: tuple[tuple[RungUnit, ...], ...]  # of each rung, one unit a seed
+    races: tuple[tuple[RaceUnit, ...], ...]  # likewise
+    rung: int = 0  # the present one
+    is_open: bool = True
+
+    @property
+    def stopped_early(self) -> bool:
+        """Whether it was closed before its last rung."""
+        return not self.is_open and self.rung < len(self.rungs) - 1
+
+
+class Tuner:
+    """A search. Optuna draws trials and stops those that fall behind; it keeps them in `study.db`.
 
     Args:
-        sweep: what is varied; each trial is trained once.
-        folder: for Tune's own files, and the best run.
-        address: of a Ray cluster, see `ray_cluster`.
-        store: URL of an object store for the trials; None: all machines see `folder` under the same path.
-        jobs: trials at a time; 0: as many as there are cores.
-        gpu_share: of a GPU, for each trial on one.
-        on_trials: called with the trials that are done and that run, now and then.
+        config: what is varied.
+        folder: of the search; units are in `folder/work`.
+        parallel: trials that are open at a time, if values depend on results (tpe).
 
-    Returns:
-        A row a trial, the best first, and those that were stopped early behind the others: its number in `draw`, the
-        values that are varied, progress_m, crash_rate and mean_speed_mps of its last episodes, the steps that it came
-        to, and whether it was stopped early.
-
-    Raises OutlapError where Ray is not installed, another sweep was begun there, or all trials failed. A
-    KeyboardInterrupt passes through.
+    Raises OutlapError if Optuna is not installed, or a trial is not valid.
     """
-    import_ray()
-    from ray import tune
-    from ray.tune.schedulers import ASHAScheduler
 
-    if sweep.seeds != 1:
-        raise OutlapError(f"seeds is {sweep.seeds}; must be 1 here: each trial is trained once")
-    drawn = sweep.draw()
-    configs = [sweep.trial_config(values) for values in drawn]  # what is wrong is said now, and not in an hour
-    total = max(config.total_steps for config in configs)
-    storage = store or str(folder.absolute())
-    kept = Store(storage)
-    _claim(sweep, kept, "--store" if store else "--out")
-    os.environ.setdefault("TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S", "0")
-    os.environ["TUNE_DISABLE_SIGINT_HANDLER"] = "1"  # or Ctrl-C makes `fit` return as if all was done
-    with ray_cluster(address), contextlib.ExitStack() as last:
-        last.callback(LISTENER.reset, LISTENER.set(on_trials))
-        surroundings = Surroundings.here()
-        gpu = {"gpu": gpu_share} if configs[0].device.startswith("cuda") else {}
-        trainable = tune.with_resources(lambda given: _trial(sweep, given[TRIAL], surroundings), {"cpu": 1, **gpu})
-        space = {TRIAL: tune.grid_search(list(range(len(drawn))))}  # those of `outlap sweep`: they follow from the seed
-        if kept.files.glob(f"{kept.root}/tune/experiment_state-*.json"):  # Tune asks for less than it needs
-            tuner = tune.Tuner.restore(f"{storage}/tune", trainable, restart_errored=True, param_space=space)
-        else:
-            tuner = tune.Tuner(
-                trainable,
-                param_space=space,
-                tune_config=tune.TuneConfig(
-                    metric=SCORE, mode="max", max_concurrent_trials=jobs or None,
-                    scheduler=ASHAScheduler(
-                        STEPS, max_t=total, grace_period=max(1, total // FIRST_CUT), stop_last_trials=False,
-                    ),
-                ),
-                run_config=tune.RunConfig(
-                    name="tune", storage_path=storage, verbose=0, callbacks=[_watch()],
-                    failure_config=tune.FailureConfig(max_failures=RETRIES),
-                    checkpoint_config=tune.CheckpointConfig(num_to_keep=1),
-                ),
-            )  # fmt: skip
-        with contextlib.redirect_stdout(io.StringIO()):  # of Tune's own tables
-            results = tuner.fit()
-    rows, checkpoints = [], []
-    for result in results:
-        metrics = result.metrics or {}
-        if SCORE in metrics:
-            told = {name: metrics[name] for name in (SCORE, "crash_rate", "mean_speed_mps", STEPS)}
-            number = (result.config or {})[TRIAL]
-            early = metrics[STEPS] < configs[number].total_steps
-            rows.append({TRIAL: number, **drawn[number], **told, "stopped_early": early})
-            checkpoints.append(result.checkpoint)
-    if not rows:
-        raise OutlapError(f"{storage}: no trial came to a result: {next(iter(results.errors), 'no episode ended')}")
-    found = pd.DataFrame(rows).sort_values(["stopped_early", SCORE], ascending=[True, False], kind="stable")
-    best = checkpoints[int(found.index[0])]
-    if best is not None:
-        shutil.rmtree(folder / "best", ignore_errors=True)  # of a trial that was the best so far
-        best.to_directory(folder / "best")
-    return found.reset_index(drop=True)
+    def __init__(self, config: SearchConfig, folder: Path, parallel: int = 1) -> None:
+        self.config, self.work = config, folder / "work"
+        self._parallel = parallel if config.sampler == "tpe" else math.inf
+        self._combinations = None if config.trials else _combinations(config)
+        self._total = config.trials or len(self._combinations or ())
+        self._study = _open_study(config, make_folder(folder))
+        self._finished: set[str] = set()  # keys
+        drawn = [known for known in self._study.trials if known.state.name != "WAITING"]
+        self.trials = [self._trial(self._live(known.number)) for known in drawn]
+        for trial, known in zip(self.trials, drawn, strict=True):
+            trial.is_open = not known.state.is_finished()
+            if not trial.is_open:  # Optuna has a value of each rung that it compared
+                last = len(trial.rungs) - 1
+                trial.rung = last if known.state.name == "COMPLETE" else max(0, len(known.intermediate_values) - 1)
+
+    def first_units(self) -> list[Unit]:
+        """Return the units to begin or resume with."""
+        known = [unit for trial in self.trials for unit in self._units(trial)]
+        return [*known, *self._draw()]
+
+    def on_done(self, unit: Unit) -> list[Unit]:
+        """Return the units that follow from a finished one, see `run_units`."""
+        self._finished.add(unit.key)
+        found: list[Unit] = []
+        for trial in list(self.trials):
+            present = (*trial.rungs[trial.rung], *trial.races[trial.rung])
+            if any(unit.key == each.key for each in present):
+                found += self._advance(trial) if trial.is_open else self._units(trial)
+        return [*found, *self._draw()]
+
+    def results(self) -> pd.DataFrame:
+        """Return a row for each trial, the best first; those that were stopped early come after the others.
+
+        Columns: trial, every varied field, progress_m (mean over seeds and episodes), progress_low_m and
+        progress_high_m (the worst and the best seed), crash_rate, mean_speed_mps, steps, stopped_early. A trial that
+        diverged has NaN.
+        """
+        rows = []
+        for trial in self.trials:
+            result = {"trial": trial.number, **trial.values}
+            if not any(rung.diverged(self.work) for rung in trial.rungs[trial.rung]):
+                result |= _judge([race.folder(self.work) for race in trial.races[trial.rung]])
+            steps = trial.rungs[trial.rung][0].steps
+            rows.append({**result, "steps": steps, "stopped_early": trial.stopped_early})
+        found = pd.DataFrame(rows)
+        if "progress_m" not in found:
+            raise OutlapError(f"{self.work}: the trainings of all trials diverged; lower learning_rate")
+        order = ["stopped_early", "progress_m"]
+        return found.sort_values(order, ascending=[True, False], kind="stable", ignore_index=True)
+
+    def _draw(self) -> list[Unit]:
+        """Draw trials, as many as may be open now; return their first units."""
+        units: list[Unit] = []
+        while len(self.trials) < self._total and sum(trial.is_open for trial in self.trials) < self._parallel:
+            if self._combinations is not None and len(self._study.trials) == len(self.trials):
+                self._study.enqueue_trial(self._combinations[len(self.trials)])
+            self.trials.append(self._trial(self._study.ask()))
+            units += self.trials[-1].rungs[0]
+        return units
+
+    def _trial(self, drawn: OptunaTrial) -> Trial:
+        values = {name: _suggest(drawn, name, each) for name, each in self.config.search.items()}
+        configs = [self.config.trial_config(values, seed) for seed in range(self.config.seeds)]
+        # Named by its content, not its number: a file with other values before it reuses the unit.
+        name = f"trial-{hashlib.sha256(to_json(configs[0]).encode()).hexdigest()[:8]}"
+        by_seed = [_rungs(f"{name}-{seed}", config, self.config.rungs) for seed, config in enumerate(configs)]
+        rungs = tuple(zip(*by_seed, strict=True))
+        races = tuple(tuple(self._race(name, *each) for each in enumerate(rung)) for rung in rungs)
+        return Trial(drawn.number, values, rungs, races)
+
+    def _race(self, trial: str, seed: int, rung: RungUnit) -> RaceUnit:
+        tracks = self.config.tracks or rung.config.env.tracks or BUILTIN_TRAIN
+        return RaceUnit(
+            name=rung.name,
+            method=trial,
+            task_set="tune",
+            table="tune",
+            seed=seed,
+            env=rung.config.env,
+            tasks=tuple(Task(track, track) for track in tracks),
+            episodes=-(-self.config.episodes // len(tracks)),
+            time_limit=self.config.time_limit,
+            score=PAPER_REWARD,
+            training=rung,
+        )
+
+    def _units(self, trial: Trial) -> list[Unit]:
+        """Return the units of a trial that can begin: trainings to its present rung, and races of those that ended."""
+        known: list[Unit] = [unit for rung in trial.rungs[: trial.rung + 1] for unit in rung]
+        for rung, race in zip(trial.rungs[trial.rung], trial.races[trial.rung], strict=True):
+            if rung.key in self._finished and not rung.diverged(self.work):
+                known.append(race)
+        return known
+
+    def _advance(self, trial: Trial) -> list[Unit]:
+        """Close a trial, or return the units to do next for it."""
+        from optuna.trial import TrialState
+
+        if any(rung.diverged(self.work) for rung in trial.rungs[trial.rung]):
+            self._study.tell(trial.number, state=TrialState.FAIL)
+            trial.is_open = False
+            return []
+        races = trial.races[trial.rung]
+        if not all(race.key in self._finished for race in races):
+            return self._units(trial)
+        score = _judge([race.folder(self.work) for race in races])["progress_m"]
+        live, step = self._live(trial.number), self.config.reduction_factor**trial.rung  # the pruner's rungs
+        if trial.rung == len(trial.rungs) - 1:
+            self._study.tell(trial.number, score)
+            trial.is_open = False
+            return []
+        if step not in self._study.trials[trial.number].intermediate_values:
+            live.report(score, step)
+        if live.should_prune():
+            self._study.tell(trial.number, state=TrialState.PRUNED)
+            trial.is_open = False
+            return []
+        trial.rung += 1
+        return self._units(trial)
+
+    def _live(self, number: int) -> OptunaTrial:
+        """Return a trial that values can be drawn for, from an earlier session as well."""
+        from optuna.trial import Trial as OptunaTrial
+
+        return OptunaTrial(self._study, self._study.trials[number]._trial_id)
 
 
-def _claim(sweep: SweepConfig, store: Store, flag: str) -> None:
-    """Keep the sweep beside Tune's files. Raises OutlapError, with the flag to change, where they are another's."""
-    path, new = f"{store.root}/sweep.json", to_json(sweep) + "\n"
-    if store.files.exists(path):
-        begun = json.loads(store.files.cat_file(path))
-    elif store.files.exists(f"{store.root}/tune"):
-        begun = {}
-    else:
-        store.files.makedirs(store.root, exist_ok=True)
-        store.files.pipe_file(f"{path}.partial", new.encode())
-        store.files.mv(f"{path}.partial", path)
-        return
-    other = [name for name, value in json.loads(new).items() if name not in begun or begun[name] != value]
-    if other:
-        raise OutlapError(f"{store.url}: a search with other {', '.join(other)} was begun there; give another {flag}")
+def _open_study(config: SearchConfig, folder: Path) -> Study:
+    """Return the study of a search, from an earlier session if there was one."""
+    try:
+        import optuna
+    except ImportError:
+        raise OutlapError("Optuna is not installed; get it with pip install 'outlap[tune]'") from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    content = to_json(config.model_copy(update={"trials": 0}))  # more trials continue a search
+    study = optuna.create_study(
+        storage=f"sqlite:///{folder.absolute()}/study.db",
+        study_name=hashlib.sha256(content.encode()).hexdigest()[:12],
+        direction="maximize",
+        pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=config.reduction_factor),
+        load_if_exists=True,
+    )
+    seed = int(np.random.SeedSequence([config.seed, len(study.trials)]).generate_state(1)[0])
+    samplers = optuna.samplers
+    study.sampler = samplers.TPESampler(seed=seed) if config.sampler == "tpe" else samplers.RandomSampler(seed=seed)
+    return study
 
 
-def _trial(sweep: SweepConfig, number: int, surroundings: Surroundings) -> None:
-    """Train with the values of a trial, in a process of Tune's."""
-    from ray import tune
-
-    surroundings.settle_in()
-    config = sweep.trial_config(sweep.draw()[number])
-    with tempfile.TemporaryDirectory(prefix="outlap-") as scratch:
-        folder = Path(scratch) / "run"
-        kept = tune.get_checkpoint()
-        begun: Run | None = None
-        if kept is not None:
-            kept.to_directory(folder)
-            begun = load_run(folder)
-        known = begun.checkpoints() if begun else []
-        latest: dict[str, Any] = {}
-
-        def report(progress: Progress) -> None:
-            nonlocal known
-            if progress.progress_m is None:  # no episode has ended yet
-                return
-            latest.update(
-                {
-                    STEPS: progress.steps,
-                    SCORE: progress.progress_m,
-                    "crash_rate": progress.crash_rate,
-                    "mean_speed_mps": progress.mean_speed_mps,
-                }
-            )
-            if progress.steps >= config.total_steps:  # the last report comes with the finished policy
-                return
-            there = Run(folder, config).checkpoints()
-            new = there != known
-            known = there
-            tune.report(dict(latest), checkpoint=tune.Checkpoint.from_directory(str(folder)) if new else None)
-
-        run = train(config, folder, resume=begun, on_progress=report)
-        if latest:
-            latest[STEPS] = run.record()[STEPS]
-            tune.report(dict(latest), checkpoint=tune.Checkpoint.from_directory(str(folder)))
+def _combinations(config: SearchConfig) -> list[dict[str, Any]]:
+    """Return the numbers of the values of every combination. Raise OutlapError for a range."""
+    counts = {}
+    for name, each in config.search.items():
+        if isinstance(each, Range):
+            raise OutlapError(f"search.{name} is a range, of which trials are drawn; say how many by trials")
+        counts[name] = len(each)
+    return [dict(zip(counts, each, strict=True)) for each in itertools.product(*map(range, counts.values()))]
 
 
-def _watch() -> Any:
-    """A callback that tells whoever listens. Tune keeps it in a file, of which a search that goes on takes it."""
-    from ray.tune import Callback
+def _suggest(trial: OptunaTrial, name: str, values: Sequence[Any] | Range) -> Any:
+    """Draw a value, or return the one that was drawn before."""
+    if not isinstance(values, Range):
+        return values[trial.suggest_categorical(name, range(len(values)))]
+    match values.distribution:
+        case "integer":
+            return trial.suggest_int(name, int(values.low), int(values.high))
+        case _:
+            return trial.suggest_float(name, values.low, values.high, log=values.distribution == "log_uniform")
 
-    class Watch(Callback):
-        """Counts the trials that are done."""
 
-        def on_step_end(self, iteration: int, trials: list, **_: Any) -> None:
-            tell = LISTENER.get()
-            if tell is not None:
-                tell(sum(t.is_finished() for t in trials), sum(t.status == "RUNNING" for t in trials))
+def _rungs(name: str, config: TrainingConfig, shares: Sequence[float]) -> list[RungUnit]:
+    """Return the units of a training, each up to a share of its steps."""
+    units: list[RungUnit] = []
+    for share in (*shares, 1.0):
+        steps = math.ceil(share * config.total_steps)
+        units.append(RungUnit(f"{name}-{steps}", config, steps=steps, previous=units[-1] if units else None))
+    return units
 
-        def __reduce__(self) -> tuple[Any, tuple]:
-            return _watch, ()
 
-    return Watch()
+def _judge(folders: Sequence[Path]) -> dict[str, float]:
+    """Return what the races of a trial say, one folder a seed."""
+    raced = [pd.read_parquet(folder / ROWS) for folder in folders]
+    progress = np.array([rows["progress_m"].to_numpy().mean() for rows in raced])
+    everything = pd.concat(raced)
+    return {
+        "progress_m": float(progress.mean()),
+        "progress_low_m": float(progress.min()),
+        "progress_high_m": float(progress.max()),
+        "crash_rate": float(np.mean(everything["outcome"].to_numpy() == CRASH)),
+        "mean_speed_mps": float(everything["mean_speed_mps"].to_numpy().mean()),
+    }

@@ -37,6 +37,10 @@ LARGEST_WEIGHT = 1e8  # of a network that has not diverged
 RECENT_EPISODES = 500  # over which training statistics are taken; a checkpoint keeps them
 
 
+class TrainingDiverged(OutlapError):
+    """A network's parameters are NaN or huge."""
+
+
 class TrainingConfig(Config):
     """A training. Each algorithm has its own, named by the field `algorithm`."""
 
@@ -252,12 +256,12 @@ def _newest_model(run: Run, environment, config: TrainingConfig):
 
 
 def _check_finite(model: Any, run: Run) -> None:
-    """Raises OutlapError for a network that has diverged, before it drives or is saved."""
+    """Raise TrainingDiverged for a network that has diverged, before it drives or is saved."""
     for name, parameter in model.policy.named_parameters():
         if not (parameter.abs() < LARGEST_WEIGHT).all():  # nor is NaN
             kept = run.checkpoints()
             last = f"the last good checkpoint is {kept[0]}" if kept else "there is no checkpoint yet"
-            raise OutlapError(
+            raise TrainingDiverged(
                 f"{run.folder}: the training diverged: {name} is NaN or beyond {LARGEST_WEIGHT:g} after "
                 f"{model.num_timesteps:,} steps; {last}; train anew with a lower --learning-rate"
             )
