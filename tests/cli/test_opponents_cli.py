@@ -179,7 +179,7 @@ def planned(monkeypatch: pytest.MonkeyPatch) -> list[OpponentUnit]:
     """Units that `opponents train` would do."""
     planned: list[OpponentUnit] = []
 
-    def note(units: Sequence[OpponentUnit], work: Path, engine: Engine, on_status: Any) -> None:
+    def note(units: Sequence[OpponentUnit], work: Path, engine: Engine, on_status: Any, on_done: Any) -> None:
         planned.extend(units)
 
     def enter(units: Sequence[OpponentUnit], work: Path, folder: Path, command: str) -> list[tuple]:
@@ -188,7 +188,7 @@ def planned(monkeypatch: pytest.MonkeyPatch) -> list[OpponentUnit]:
         return [(unit, rows, "entered") for unit in units]
 
     monkeypatch.setattr("outlap.experiments.runner.run_units", note)
-    monkeypatch.setattr("outlap.experiments.population.enter_all", enter)
+    monkeypatch.setattr("outlap.experiments.opponent_units.enter_all", enter)
     return planned
 
 

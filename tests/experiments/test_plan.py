@@ -11,9 +11,9 @@ import yaml
 from outlap.config import bounds
 from outlap.errors import OutlapError
 from outlap.experiments.definitions import FOLDERS, Budget
-from outlap.experiments.plan import Plan, artefacts, make_plan, remember_tracks
 from outlap.experiments.opponent_units import OpponentUnit
 from outlap.experiments.paper_units import ClippingUnit, RaceUnit, TrainingUnit, adaptation_settings
+from outlap.experiments.plan import Plan, artefacts, make_plan, remember_tracks
 from outlap.mql.propensity import AdaptiveBetaClip
 
 

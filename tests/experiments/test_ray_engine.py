@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,12 +23,11 @@ from ray.cluster_utils import Cluster
 from fake_units import Fake, begun, ended
 from outlap.errors import OutlapError
 from outlap.experiments.engine import LocalEngine
-from outlap.experiments.ray_engine import RayEngine, _Board
+from outlap.experiments.ray_engine import RayEngine, ray_cluster
 from outlap.experiments.runner import Status, run_units
+from outlap.experiments.search import SearchConfig
 from outlap.experiments.store import Store
-from outlap.experiments.sweep import Range, SweepConfig
-from outlap.experiments.tune import tune_trials
-from outlap.training.run import load_run
+from outlap.experiments.tune import Tuner
 
 pytestmark = pytest.mark.slow
 TESTS = str(Path(__file__).parents[1])
@@ -163,6 +160,12 @@ def test_a_unit_uses_its_share_of_a_gpu(cluster: Cluster, tmp_path: Path):
     assert [(unit.folder(tmp_path / "whole") / "gpus").read_text() for unit in whole] == ["0", "0"]
 
 
+def test_a_cluster_that_is_joined_already_is_kept(cluster: Cluster):
+    with ray_cluster("auto"):
+        assert ray.is_initialized()
+    assert ray.is_initialized()
+
+
 SCRIPT = """
 import sys
 from pathlib import Path
@@ -192,36 +195,13 @@ def test_after_ctrl_c_or_a_kill_of_the_driver_the_same_units_go_on(
     assert len(begun(long, work)) == 2
 
 
-def test_ctrl_c_does_not_wait_for_the_next_report(cluster: Cluster, tmp_path: Path):
-    unit = Fake("deaf", until="never", silent=True)
-    process = started(cluster, tmp_path, 'Fake("deaf", until="never", silent=True)')
-    wait_for(lambda: begun(unit, tmp_path / "work"))
-    time.sleep(0.5)
-    process.send_signal(signal.SIGINT)
-    process.wait(timeout=20.0)  # it takes 2 s, and a minute where the unit does not hear of it
-    with FileLock(unit.folder(tmp_path / "work") / ".lock", timeout=5.0):  # which the unit held
-        assert not unit.is_done(tmp_path / "work")
-
-
-def test_units_hear_at_once_that_they_are_to_stop():
-    async def told() -> tuple[bool, bool, bool]:
-        board = _Board()
-        before = await board.report("first", 0.5, patience=0.0)
-        asked = asyncio.create_task(board.report("second", 0.25, patience=3600.0))
-        await asyncio.sleep(0.0)
-        assert board.stop() == {"first": 0.5, "second": 0.25}
-        return before, await asyncio.wait_for(asked, 60.0), await board.report("third", 0.0, patience=0.0)
-
-    assert asyncio.run(told()) == (False, True, True)
-
-
 def test_ctrl_c_ends_units_that_cannot_be_told(cluster: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     engine, unit = RayEngine(), Fake("deaf", until="never", silent=True)
     (tmp_path / ".lock").touch()
-    engine.open([unit], tmp_path)
+    engine.open(tmp_path)
     engine.submit(unit)
     wait_for(lambda: begun(unit, tmp_path))
-    ray.kill(engine._board)
+    ray.kill(engine._progress)
     wait_for(lambda: not engine.shares())  # it is gone a moment later
     engine.close()
     assert "cannot be told to stop" in caplog.text
@@ -271,55 +251,24 @@ SHORT = {
 }  # fmt: skip
 
 
-def test_tune_stops_what_falls_behind_and_keeps_the_best(cluster: Cluster, tmp_path: Path):
-    sweep = SweepConfig(algorithm="ppo", training=SHORT, search={"learning_rate": (1e-3, 1e-5)})
-    counts: list[int] = []
-    found = tune_trials(sweep, tmp_path, on_trials=lambda done, running: counts.append(done))
+def test_a_search_stops_what_falls_behind_and_keeps_the_best(cluster: Cluster, store: str | None, tmp_path: Path):
+    config = SearchConfig(
+        algorithm="ppo",
+        training=SHORT,
+        search={"learning_rate": (1e-3, 1e-5)},
+        rungs=(0.25,),
+        episodes=4,
+        time_limit=1.0,
+    )
+    tuner = Tuner(config, tmp_path)
+    run_units(tuner.first_units(), tuner.work, RayEngine(store=store), on_done=tuner.on_done)
+    found = tuner.results()
     assert sorted(found["learning_rate"]) == [1e-5, 1e-3]
     assert found["steps"].iloc[0] == 4096
     assert not found["stopped_early"].iloc[0]
-    assert counts[-1] == 2
-    best = load_run(tmp_path / "best")
+    best = tuner.trials[int(found["trial"].iloc[0])].rungs[-1][0].run(tuner.work)
+    assert best.finished
     assert best.config.learning_rate == found["learning_rate"].iloc[0]
-    assert best.finished  # though no checkpoint is due before its end
-    assert best.policy_path == best.folder / "policy.zip"
-    again = tune_trials(sweep, tmp_path)  # nothing is left to do
-    pd.testing.assert_frame_equal(again, found)
-
-
-def test_tune_ranks_meta_trainings_that_are_done_first(cluster: Cluster, tmp_path: Path):
-    # Reports come every 32 actions of a world, which the end is not one of.
-    training = {
-        "total_steps": 600, "num_envs": 4, "learning_starts": 32, "batch_size": 16, "buffer_size": 4000,
-        "env": {"tracks": ["Nightjar"], "augment_tracks": False, "beams": 8, "termination": {"time_limit": 1.0}},
-    }  # fmt: skip
-    found = tune_trials(SweepConfig(algorithm="mql", training=training, search={"gamma": (0.99,)}), tmp_path)
-    assert found["steps"].tolist() == [600]
-    assert found["stopped_early"].tolist() == [False]
-    assert load_run(tmp_path / "best").finished
-
-
-def test_tune_that_is_interrupted_goes_on_with_the_trials_that_follow_from_the_seed(cluster: Cluster, tmp_path: Path):
-    sweep = SweepConfig(
-        algorithm="ppo",
-        training=SHORT,
-        search={"gamma": Range(distribution="uniform", low=0.9, high=1.0)},
-        trials=2,
-        seed=3,
-    )
-    lock = threading.RLock()  # as a progress bar has one
-
-    def stop(done: int, running: int) -> None:
-        with lock:
-            if running:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        tune_trials(sweep, tmp_path, on_trials=stop)
-    counts: list[int] = []
-    found = tune_trials(sweep, tmp_path, on_trials=lambda done, running: counts.append(done))
-    assert counts[-1] == 2
-    drawn = sweep.draw()
-    assert [drawn[number]["gamma"] for number in found["trial"]] == found["gamma"].tolist()
-    assert sorted(found["trial"]) == [0, 1]
-    assert load_run(tmp_path / "best").config.gamma == found["gamma"].iloc[0]
+    again = Tuner(config, tmp_path)
+    run_units(again.first_units(), again.work, RayEngine(store=store), on_done=again.on_done)
+    pd.testing.assert_frame_equal(again.results(), found)

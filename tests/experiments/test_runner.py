@@ -80,7 +80,8 @@ def test_a_process_that_dies_before_the_next_unit_is_submitted(busy: bool, tmp_p
             released.touch()
             wait_for(lambda: outcomes.extend(engine.wait(0.1)) or outcomes)
         os.kill(next(iter(engine._workers.pool._processes)), signal.SIGKILL)
-        wait_for(lambda: engine._workers.pool._broken)
+        pool = engine._workers.pool
+        wait_for(lambda: pool._broken)  # type: ignore[attr-defined]
         engine.submit(second)
         released.touch()
         wait_for(lambda: outcomes.extend(engine.wait(0.1)) or len(outcomes) == 2)

@@ -118,9 +118,7 @@ class RecordLap(Command):
         data = {"lap": path, "lap_time_s": float(lap[-1, 0]), "points": len(lap)}
         return CommandResult(
             data,
-            lambda console: console.print(
-                f"{lap[-1, 0]:.2f} s, {len(lap)} points: {path}"
-            ),
+            lambda console: console.print(f"{lap[-1, 0]:.2f} s, {len(lap)} points: {path}"),
         )
 
 

@@ -71,7 +71,9 @@ class WorkCommand(LongCommand):
         engine = self._make_engine(remember_tracks({*tracks, *(name for unit in units for name in unit.tracks)}, work))
         with self.progress(title, 1000, "‰") as update:
             try:
-                run_units(units, work, engine, lambda status: update(round(1000 * status.share), _note(status)), on_done)
+                run_units(
+                    units, work, engine, lambda status: update(round(1000 * status.share), _note(status)), on_done
+                )
             except KeyboardInterrupt:
                 print(f"\nsaved; {resume}", file=sys.stderr)
                 raise

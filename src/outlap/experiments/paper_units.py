@@ -18,7 +18,7 @@ from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.definitions import changed
 from outlap.experiments.opponent_units import PopulationUnit
 from outlap.experiments.unit import Report, Unit
-from outlap.training.mql import MQLConfig, load_meta
+from outlap.training.mql import load_meta
 from outlap.training.session import TrainingConfig
 
 if TYPE_CHECKING:

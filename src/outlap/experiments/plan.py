@@ -15,8 +15,8 @@ from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
 from outlap.experiments.definitions import Budget, Circuits, Method, TaskSet, changed, find, merge, names_of
 from outlap.experiments.opponent_units import OpponentUnit, PopulationUnit
-from outlap.experiments.unit import Unit
 from outlap.experiments.paper_units import POPULATION, ClippingUnit, RaceUnit, Task, TrainingUnit, adaptation_settings
+from outlap.experiments.unit import Unit
 from outlap.files import atomic_write, to_json
 from outlap.track.catalog import find_entry, load_track
 from outlap.training.ppo import PPOConfig

@@ -14,8 +14,9 @@ import yaml
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments import figures
 from outlap.experiments.document import Document
-from outlap.experiments.plan import CLIPPING_TASKS, Plan
 from outlap.experiments.opponent_units import OpponentUnit
+from outlap.experiments.paper_units import COLLECTING_WORLDS, adaptation_settings
+from outlap.experiments.plan import CLIPPING_TASKS, Plan
 from outlap.experiments.results import (
     METRICS,
     Cell,
@@ -27,7 +28,6 @@ from outlap.experiments.results import (
     table_result,
 )
 from outlap.experiments.unit import done_record
-from outlap.experiments.paper_units import COLLECTING_WORLDS, adaptation_settings
 from outlap.files import atomic_write, to_json
 from outlap.mql.propensity import CLIP_RULES
 from outlap.provenance import provenance
