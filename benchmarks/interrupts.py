@@ -34,7 +34,7 @@ training: {total_steps: 1000000000, env: {tracks: [Foxglove]}}
 search: {gamma: [0.9, 0.99]}
 """
 
-# What each command is started with; META stands for a run folder of `train mql`, SEARCH for a file of `sweep`, OUT for
+# What each command is started with; META stands for a run folder of `train mql`, SEARCH for a file of `tune`, OUT for
 # a new folder.
 COMMANDS: dict[str, list[str]] = {
     "train ppo": ["--total-steps", ENDLESS, "--out", "OUT"],
@@ -49,8 +49,7 @@ COMMANDS: dict[str, list[str]] = {
 WITH_RAY: dict[str, list[str]] = {
     "reproduce ray": [*COMMANDS["reproduce"], *RAY],
     "opponents train ray": [*COMMANDS["opponents train"], *RAY],
-    "sweep ray": ["SEARCH", "--out", "OUT", *RAY],
-    "tune ray": ["SEARCH", "--out", "OUT", "--address", "local"],
+    "tune ray": ["SEARCH", "--out", "OUT", *RAY],
 }
 
 

@@ -39,7 +39,6 @@ LONG_FUNCTIONS: set[str] = {
     "outlap.cli.evaluate.evaluate_into",
     "outlap.envs.race_vector_env.__init__",
     "outlap.evaluation.rollout._race",
-    "outlap.experiments.tune.tune_trials",
     "outlap.mql.adaptation.adapt",
     "outlap.mql.learner.td3_update",
     "outlap.mql.mql.__init__",
