@@ -1,31 +1,8 @@
-"""Environments: Gymnasium, Gymnasium's vector interface, Stable-Baselines3."""
+"""Environments: Gymnasium, Gymnasium's vector interface, Stable-Baselines3.
 
-from __future__ import annotations
+The names of `__init__.pyi` are imported when they are first used: Stable-Baselines3 brings PyTorch.
+"""
 
-from typing import TYPE_CHECKING, Any
+import lazy_loader
 
-if TYPE_CHECKING:
-    from outlap.envs.race_config import RaceConfig
-    from outlap.envs.race_env import RaceEnv
-    from outlap.envs.race_vector_env import RaceVectorEnv
-    from outlap.envs.sb3_vec_env import SB3VecEnv
-    from outlap.envs.tasks import TaskSet, TaskSplit
-
-__all__ = ["RaceConfig", "RaceEnv", "RaceVectorEnv", "SB3VecEnv", "TaskSet", "TaskSplit"]
-
-_HOMES = {
-    "RaceConfig": "race_config",
-    "RaceEnv": "race_env",
-    "RaceVectorEnv": "race_vector_env",
-    "SB3VecEnv": "sb3_vec_env",
-    "TaskSet": "tasks",
-    "TaskSplit": "tasks",
-}
-
-
-def __getattr__(name: str) -> Any:  # imported when asked for: SB3 brings torch
-    if name in _HOMES:
-        from importlib import import_module
-
-        return getattr(import_module(f"outlap.envs.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
