@@ -154,8 +154,9 @@ def full_run(folder: Path, rows: int) -> None:
     from outlap.envs.sb3_vec_env import SB3VecEnv
     from outlap.mql.context_vec_env import ContextVecEnv
     from outlap.mql.mql import MQL
+    from outlap.training.checkpoints import save_checkpoint
     from outlap.training.mql import MQLConfig
-    from outlap.training.run import create_run, save_checkpoint
+    from outlap.training.run import create_run
 
     config = MQLConfig(total_steps=1_000_000_000, learning_starts=0, buffer_size=rows)
     model = config.make_model(SB3VecEnv(config.num_envs, **dict(config.env)))

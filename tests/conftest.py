@@ -18,9 +18,10 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_cache(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Iterator[None]:
-    """Lines are planned once for all tests, and the user's cache is left alone."""
+    """Lines are planned once for all tests; the user's cache and the system's temporary folder are left alone."""
     base = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(base / "sb3-logs"))  # of models that a test trains outside of a session
         patch.setenv("OUTLAP_CACHE", str((base if worker_id == "master" else base.parent) / "outlap-cache"))
         yield
 

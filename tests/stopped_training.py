@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from outlap.training.session import Progress, TrainingConfig, train
+from outlap.training.config import TrainingConfig
+from outlap.training.session import Progress, train
 
 
 def stopped_after(steps: int, config: TrainingConfig, folder: Path) -> None:

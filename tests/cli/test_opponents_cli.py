@@ -19,7 +19,7 @@ from outlap.drivers.population import read_manifest
 from outlap.experiments.engine import Engine
 from outlap.experiments.opponent_units import OpponentUnit
 from outlap.track.map_io import write_track
-from outlap.training.population import Opponent
+from outlap.training.opponents import Opponent
 from small_populations import driver, population, ring_driver, save_population
 from synthetic_tracks import ring
 

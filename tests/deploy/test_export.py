@@ -18,11 +18,11 @@ from outlap.envs.race_config import RaceConfig
 from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.errors import OutlapError
 from outlap.track.map_io import write_track
+from outlap.training.config import TrainingConfig
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.recurrent_ppo import RecurrentPPOConfig
 from outlap.training.run import Run, create_run
-from outlap.training.session import TrainingConfig
 from synthetic_tracks import ring
 
 TERMS = ("scan", "vel", "heading", "previous_action")

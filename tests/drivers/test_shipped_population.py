@@ -10,7 +10,7 @@ from outlap.envs.race_config import RaceConfig
 from outlap.evaluation.rollout import evaluate, standing_starts
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track import load_track
-from outlap.training.population import opponent_defaults, verify
+from outlap.training.opponents import opponent_defaults, verify
 
 
 def test_its_members_are_the_papers_speeds_and_all_verified() -> None:

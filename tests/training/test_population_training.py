@@ -21,7 +21,7 @@ from outlap.experiments.opponent_units import OpponentUnit, enter_all
 from outlap.experiments.runner import run_units
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track.map_io import write_track
-from outlap.training.population import SLOWEST, Opponent, enter, opponent_config, verify
+from outlap.training.opponents import SLOWEST, Opponent, enter, opponent_config, verify
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
 from small_populations import driver, ring_driver

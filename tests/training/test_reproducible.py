@@ -22,11 +22,12 @@ from outlap.experiments.figures import read_learning
 from outlap.mql.adaptation import AdaptationSettings, adapt
 from outlap.mql.mql import MQL
 from outlap.track import load_track
+from outlap.training.config import TrainingConfig
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.recurrent_ppo import RecurrentPPOConfig
 from outlap.training.run import Run, load_run
-from outlap.training.session import Progress, TrainingConfig, train
+from outlap.training.session import Progress, train
 
 ENV = RaceConfig(
     tracks=("ring5",), beams=32, control_interval=5, speed_range=(0.0, 4.0), observation=("scan", "vel"),

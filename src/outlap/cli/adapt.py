@@ -139,8 +139,7 @@ class Adapt:
         from outlap.mql.propensity import CLIP_RULES
         from outlap.provenance import provenance
         from outlap.track.catalog import load_tracks
-        from outlap.training.mql import load_meta
-        from outlap.training.run import load_run
+        from outlap.training.run import load_meta, load_run
 
         for name in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
             check_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)

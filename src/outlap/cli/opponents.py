@@ -20,14 +20,14 @@ from outlap.cli.output import CommandResult
 from outlap.cli.work import WorkCommand
 from outlap.drivers.population import Split, load_population, read_manifest
 from outlap.errors import OutlapError
-from outlap.training.population import opponent_defaults
+from outlap.training.opponents import opponent_defaults
 from outlap.training.ppo import PPOConfig
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Console
 
-    from outlap.training.population import Opponent
+    from outlap.training.opponents import Opponent
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class ListOpponents(Command):
 
 def _opponents(track: str, speeds: Sequence[float], held_out: Sequence[float]) -> list[Opponent]:
     """Those to train, named after their track and top speed."""
-    from outlap.training.population import SLOWEST, Opponent
+    from outlap.training.opponents import SLOWEST, Opponent
 
     halves: tuple[tuple[Split, Sequence[float]], ...] = (("train", speeds), ("held_out", held_out))
     prefix = re.sub(r"[^\w.-]+", "-", track)
@@ -184,7 +184,7 @@ class VerifyOpponents(LongCommand):
 
     def run(self) -> CommandResult:
         from outlap.track import load_track
-        from outlap.training.population import Opponent, enter, verify
+        from outlap.training.opponents import Opponent, enter, verify
 
         check_least("--laps", self.laps, 1)
         check_least("--starts", self.starts, 1)
@@ -205,7 +205,7 @@ class VerifyOpponents(LongCommand):
 
 
 def _row(opponent: Opponent, rows: pd.DataFrame, verified: bool) -> dict[str, Any]:
-    from outlap.training.population import crash_rate
+    from outlap.training.opponents import crash_rate
 
     lap_times = rows["lap_time_s"].to_numpy()
     return {

@@ -17,14 +17,16 @@ from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.config import load_config
 from outlap.errors import OutlapError
+from outlap.training.config import TrainingConfig
 from outlap.training.mql import MQLConfig
 from outlap.training.ppo import PPOConfig
 from outlap.training.recurrent_ppo import RecurrentPPOConfig
 from outlap.training.run import Run, load_run
-from outlap.training.session import Progress, TrainingConfig, train
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from outlap.training.callback import Progress
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,8 @@ class TrainMQL(_Train):
 
 def train_with_progress(config: TrainingConfig, folder: Path, resumed: Run | None, quiet: bool) -> Run:
     """Train with a progress bar; after Ctrl-C say how to go on."""
+    from outlap.training.session import train
+
     with progress_bar("training", config.total_steps, "steps", quiet) as update:
 
         def on_progress(progress: Progress) -> None:

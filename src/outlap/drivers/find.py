@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from outlap import plugins
 from outlap.drivers.centerline_follower import CenterlineFollower
 from outlap.drivers.driver import Driver
 from outlap.drivers.follow_the_gap import FollowTheGap
@@ -63,7 +64,7 @@ def _drivers(name: Named, field_of_view: float, split: Split | None, run_code: b
     if path.suffix == ".csv":
         return [Ghost.load(path)]
     if (path / "config.yaml").is_file():
-        return [_run(path)]
+        return [plugins.load("outlap.driver_loaders", "run")(path)]
     module, _, function = text.partition(":")
     if function and module.replace(".", "").isidentifier():
         if not run_code:
@@ -77,13 +78,6 @@ def _drivers(name: Named, field_of_view: float, split: Split | None, run_code: b
     if (path.parent / MANIFEST).is_file():
         return load_population(path.parent, split, path.name.removesuffix(".safetensors"))
     raise OutlapError(f"driver is {text!r}; must be {OFFERED}")
-
-
-def _run(folder: Path) -> Driver:
-    # Here, since training builds environments, and those look up drivers.
-    from outlap.training.run import load_run
-
-    return load_run(folder).driver()
 
 
 def _function(module: str, function: str) -> Driver:

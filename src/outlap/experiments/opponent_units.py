@@ -15,7 +15,7 @@ from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.unit import Report, Unit
 from outlap.files import replacing
 from outlap.track.catalog import load_track
-from outlap.training.population import Opponent, enter, train_opponent, verify
+from outlap.training.opponents import Opponent, enter, train_opponent, verify
 from outlap.training.ppo import PPOConfig
 
 COMMAND = "outlap reproduce"  # for the manifest of a population that an experiment trains

@@ -18,8 +18,8 @@ from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.definitions import changed
 from outlap.experiments.opponent_units import PopulationUnit
 from outlap.experiments.unit import Report, Unit
-from outlap.training.mql import load_meta
-from outlap.training.session import TrainingConfig
+from outlap.training.config import TrainingConfig
+from outlap.training.run import load_meta
 
 if TYPE_CHECKING:
     from outlap.mql.adaptation import AdaptationSettings

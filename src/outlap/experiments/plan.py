@@ -19,6 +19,7 @@ from outlap.experiments.paper_units import POPULATION, ClippingUnit, RaceUnit, T
 from outlap.experiments.unit import Unit
 from outlap.files import atomic_write, to_json
 from outlap.track.catalog import find_entry, load_track
+from outlap.training.algorithms import ALGORITHMS
 from outlap.training.ppo import PPOConfig
 
 FIGURE_2, APPENDIX, ALL = "figure-2", "appendix", "all"
@@ -275,7 +276,7 @@ class _Planner:
         return self._population(self._circuits(task_set)) if uses else None
 
     def _population(self, circuits: Circuits) -> PopulationUnit | None:
-        from outlap.training.population import opponent_defaults
+        from outlap.training.opponents import opponent_defaults
 
         if self.budget.population is None:
             return None
@@ -316,12 +317,9 @@ class _Planner:
 
 def training_class(algorithm: str) -> Any:
     """The configuration of an algorithm."""
-    from outlap.training.run import config_classes
-
-    classes = config_classes()
-    if algorithm not in classes:
-        raise OutlapError(f"algorithm is {algorithm!r}; must be one of {', '.join(classes)}")
-    return classes[algorithm]
+    if algorithm not in ALGORITHMS:
+        raise OutlapError(f"algorithm is {algorithm!r}; must be one of {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[algorithm]
 
 
 def _with_track(changes: Any, track: str) -> Any:

@@ -19,7 +19,7 @@ from pydantic import Field, field_validator
 from outlap.config import Config, validate
 from outlap.experiments.definitions import merge
 from outlap.experiments.plan import training_class
-from outlap.training.session import TrainingConfig
+from outlap.training.config import TrainingConfig
 
 Distribution = Literal["uniform", "log_uniform", "integer"]
 

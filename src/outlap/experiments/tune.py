@@ -25,8 +25,10 @@ from outlap.experiments.search import Range, SearchConfig
 from outlap.experiments.unit import DONE, Report, Unit
 from outlap.files import atomic_write, make_folder, to_json
 from outlap.track.generate import BUILTIN_TRAIN
+from outlap.training.checkpoints import TrainingDiverged
+from outlap.training.config import TrainingConfig
 from outlap.training.run import Run, load_run
-from outlap.training.session import Progress, TrainingConfig, TrainingDiverged, train
+from outlap.training.session import Progress, train
 
 if TYPE_CHECKING:
     from optuna import Study

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     from outlap.envs.sb3_vec_env import SB3VecEnv
-    from outlap.training.session import TrainingConfig
+    from outlap.training.config import TrainingConfig
 
 PICKLED = ("observation_space", "action_space", "ep_info_buffer", "ep_success_buffer")  # attributes that are read
 LARGEST = 2**31  # [bytes] of all that a file holds
@@ -76,7 +76,7 @@ def load_model(
 
 
 class _DataUnpickler(pickle.Unpickler):
-    """Of what cannot run code."""
+    """Unpickler restricted to an allow-list of data types."""
 
     def find_class(self, module: str, name: str) -> Any:
         if name not in DATA.get(module, ()):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator
@@ -10,17 +9,11 @@ from tyro.conf import arg
 
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
-from outlap.errors import OutlapError
-from outlap.training.device import check_device
-from outlap.training.model_file import load_model
+from outlap.training.config import RECENT_EPISODES, TrainingConfig
 from outlap.training.ppo import PPOConfig
-from outlap.training.session import RECENT_EPISODES, TrainingConfig
 
 if TYPE_CHECKING:
     from outlap.mql.mql import MQL
-    from outlap.training.run import Run
-
-log = logging.getLogger(__name__)
 
 
 class MQLConfig(TrainingConfig):
@@ -105,21 +98,3 @@ class MQLConfig(TrainingConfig):
         from outlap.mql.mql import MQL
 
         return MQL
-
-
-def load_meta(run: Run) -> MQL:
-    """A meta-trained policy with its replay, on the device that it was trained on, or on the CPU if that is not there.
-
-    Raises OutlapError for a run of another algorithm, and broken files.
-    """
-    if run.config.algorithm != "mql":
-        raise OutlapError(f"{run.folder}: was trained with {run.config.algorithm}; must be one of outlap train mql")
-    device = run.config.device
-    try:
-        check_device(device)
-    except OutlapError:
-        log.warning("%s: was trained on device %s, which is not there; it goes on on the CPU", run.folder, device)
-        device = "cpu"
-    meta: Any = load_model(run.config, run.policy_path, device=device)
-    meta.load_replay_buffer(run.replay_path)
-    return meta

@@ -9,7 +9,7 @@ from pydantic import Field
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.simulator.vehicle import LidarParams, VehicleParams
-from outlap.training.session import RECENT_EPISODES, TrainingConfig
+from outlap.training.config import RECENT_EPISODES, TrainingConfig
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

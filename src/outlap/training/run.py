@@ -22,17 +22,18 @@ from typing import TYPE_CHECKING, Any
 
 from outlap.config import read_yaml, save_config, validate
 from outlap.errors import OutlapError
-from outlap.files import atomic_write, replacing, to_json
+from outlap.files import atomic_write, to_json
 from outlap.provenance import provenance
+from outlap.training.algorithms import ALGORITHMS
+from outlap.training.config import TrainingConfig
+from outlap.training.device import check_device
 from outlap.training.model_file import load_model
 
 if TYPE_CHECKING:
     from outlap.drivers.policy import PolicyDriver
-    from outlap.training.session import TrainingConfig
+    from outlap.mql.mql import MQL
 
 log = logging.getLogger(__name__)
-
-CHECKPOINTS_KEPT = 3
 
 
 @dataclass(frozen=True)
@@ -141,37 +142,35 @@ def load_run(folder: str | os.PathLike[str]) -> Run:
     return Run(folder, validate(_config_class(content, path), content, str(path)))
 
 
-def config_classes() -> dict[str, type[TrainingConfig]]:
-    """The configuration of every algorithm, by its name."""
-    from outlap.training.mql import MQLConfig
-    from outlap.training.ppo import PPOConfig
-    from outlap.training.recurrent_ppo import RecurrentPPOConfig
+def load_driver(folder: str | os.PathLike[str]) -> PolicyDriver:
+    """Return the policy of a run folder as a driver: the entry point `run` of `outlap.driver_loaders`."""
+    return load_run(folder).driver()
 
-    return {"ppo": PPOConfig, "recurrent-ppo": RecurrentPPOConfig, "mql": MQLConfig}
+
+def load_meta(run: Run) -> MQL:
+    """Load a meta-trained policy with its replay buffer, on the device of its training, or on the CPU without that.
+
+    Raises OutlapError for a run of another algorithm, and for broken files.
+    """
+    if run.config.algorithm != "mql":
+        raise OutlapError(f"{run.folder}: was trained with {run.config.algorithm}; must be one of outlap train mql")
+    device = run.config.device
+    try:
+        check_device(device)
+    except OutlapError:
+        log.warning("%s: was trained on device %s, which is not there; it goes on on the CPU", run.folder, device)
+        device = "cpu"
+    meta: Any = load_model(run.config, run.policy_path, device=device)
+    meta.load_replay_buffer(run.replay_path)
+    return meta
 
 
 def _config_class(content: Any, path: Path) -> type[TrainingConfig]:
-    """The configuration of the algorithm that a file's content names; PPO's where it names none."""
-    classes = config_classes()
+    """Return the configuration class of the algorithm that a file's content names; PPO's if it names none."""
     name = content.get("algorithm", "ppo") if isinstance(content, Mapping) else "ppo"
-    if name not in classes:
-        raise OutlapError(f"{path}: algorithm is {name!r:.60}; must be one of {', '.join(classes)}")
-    return classes[name]
-
-
-def save_checkpoint(run: Run, model: Any, name: str, replay_name: str) -> Path:
-    """Write a Stable-Baselines3 model, and its replay before it: no model is without the one that belongs to it.
-
-    Both are written beside their places and renamed there. Then the oldest checkpoints go, and other replays.
-    """
-    path, replay = run.folder / name, run.folder / replay_name
-    if getattr(model, "replay_buffer", None) is not None:
-        model.save_replay_buffer(replay)
-    with replacing(path) as partial:
-        model.save(partial)
-    for old in (*run.checkpoints()[CHECKPOINTS_KEPT:], *(each for each in run.replays() if each != replay)):
-        old.unlink(missing_ok=True)
-    return path
+    if name not in ALGORITHMS:
+        raise OutlapError(f"{path}: algorithm is {name!r:.60}; must be one of {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]
 
 
 def _steps_of(checkpoint: Path) -> int:
