@@ -22,9 +22,10 @@ from outlap.experiments.runner import run_units
 from outlap.experiments.search import SearchConfig
 from outlap.experiments.tune import RungUnit, Tuner
 from outlap.experiments.unit import Unit
+from outlap.training.checkpoints import TrainingDiverged
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
-from outlap.training.session import TrainingDiverged, train
+from outlap.training.session import train
 
 TINY = {
     "total_steps": 256, "num_envs": 4, "n_steps": 16, "batch_size": 32, "n_epochs": 1, "net_arch": [8],
