@@ -151,6 +151,7 @@ def full_run(folder: Path, rows: int) -> None:
     """Make a run of `train mql` whose replay is as full as it gets: what takes longest to save."""
     import numpy as np
 
+    from outlap.envs.race_vector_env import RaceVectorEnv
     from outlap.envs.sb3_vec_env import SB3VecEnv
     from outlap.mql.context_vec_env import ContextVecEnv
     from outlap.mql.mql import MQL
@@ -159,7 +160,7 @@ def full_run(folder: Path, rows: int) -> None:
     from outlap.training.run import create_run
 
     config = MQLConfig(total_steps=1_000_000_000, learning_starts=0, buffer_size=rows)
-    model = config.make_model(SB3VecEnv(config.num_envs, **dict(config.env)))
+    model = config.make_model(SB3VecEnv(RaceVectorEnv(config.num_envs, config.env)))
     env = model.env
     assert isinstance(model, MQL)
     assert isinstance(env, ContextVecEnv)

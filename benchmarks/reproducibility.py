@@ -56,13 +56,13 @@ def tracks(folder: Path) -> str:
 
 
 def simulator(folder: Path) -> str:
-    from outlap.envs import RaceVectorEnv
+    from outlap.envs import make_race_vector
     from outlap.track.generate import generate_track
 
     found = []
     circuit = generate_track(3, length=120.0)
     for model in ("kinematic", "single_track", "drift"):
-        env = RaceVectorEnv(
+        env = make_race_vector(
             64, tracks=[circuit], num_cars=2, model=model, beams=108, vehicle={"mu": (0.5, 1.1)},
             lidar={"noise_std": 0.02}, start={"speed": (0.0, 6.0)},
         )  # fmt: skip
@@ -118,7 +118,7 @@ def mql(folder: Path) -> str:
 
 
 def adaptation(folder: Path) -> str:
-    from outlap.envs import SB3VecEnv
+    from outlap.envs import RaceVectorEnv, SB3VecEnv
     from outlap.mql.adaptation import AdaptationSettings, adapt
     from outlap.mql.mql import MQL
     from outlap.training.run import load_run
@@ -126,7 +126,7 @@ def adaptation(folder: Path) -> str:
     run = load_run(folder / "given" / "mql")
     meta = MQL.load(run.policy_path, device="cpu")
     meta.load_replay_buffer(run.replay_path)
-    task = SB3VecEnv(8, **{**dict(run.config.env), "tracks": ("Brackenfell",)})
+    task = SB3VecEnv(RaceVectorEnv(8, run.config.env.model_copy(update={"tracks": ("Brackenfell",)})))
     task.seed(3)
     policy, record = adapt(meta, task, AdaptationSettings(iterations=2, collect_steps=40))
     return digest(repr(record.updates), *(value.numpy() for value in policy.state_dict().values()))

@@ -5,16 +5,16 @@ from __future__ import annotations
 import torch
 from stable_baselines3 import PPO
 
+from outlap.envs import RaceVectorEnv, SB3VecEnv
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.track.track import Track
 
 
 def untrained_ppo(config: RaceConfig, track: Track, width: int = 16, seed: int = 0) -> PPO:
     """A PPO model for a task after a single update, with actions all over their range."""
-    settings = {**dict(config), "tracks": [track]}
+    env = SB3VecEnv(RaceVectorEnv(2, config, [track]))
     model = PPO(
-        "MultiInputPolicy", SB3VecEnv(2, **settings), n_steps=4, batch_size=8, n_epochs=1, seed=seed, device="cpu",
+        "MultiInputPolicy", env, n_steps=4, batch_size=8, n_epochs=1, seed=seed, device="cpu",
         policy_kwargs={"net_arch": [width, width]},
     )  # fmt: skip
     model.learn(8)

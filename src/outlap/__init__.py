@@ -21,6 +21,6 @@ else:
     if "outlap/Race-v0" not in gymnasium.registry:
         gymnasium.register(
             "outlap/Race-v0",
-            entry_point="outlap.envs.race_env:RaceEnv",
-            vector_entry_point="outlap.envs.race_vector_env:RaceVectorEnv",
+            entry_point="outlap.envs.keywords:make_race",
+            vector_entry_point="outlap.envs.keywords:make_race_vector",
         )

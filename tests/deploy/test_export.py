@@ -14,8 +14,8 @@ import torch
 from outlap.cli.main import main
 from outlap.deploy.car_driver import METADATA, CarDriver
 from outlap.deploy.export import compare, export_policy
+from outlap.envs import RaceVectorEnv, SB3VecEnv
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.errors import OutlapError
 from outlap.track.map_io import write_track
 from outlap.training.config import TrainingConfig
@@ -40,7 +40,7 @@ def track(tmp_path_factory: pytest.TempPathFactory) -> str:
 def run_of(config: type[TrainingConfig], folder: Path, track: str, env: dict[str, Any], **settings: Any) -> Run:
     """A run whose policy has learnt nothing, and acts all over its range."""
     run = create_run(folder, config(env=RaceConfig(tracks=(track,), **env), **settings))
-    model = run.config.make_model(SB3VecEnv(2, **dict(run.config.env)))
+    model = run.config.make_model(SB3VecEnv(RaceVectorEnv(2, run.config.env)))
     policy: Any = model.policy
     with torch.no_grad():  # both begin with actions near 0
         last = policy.actor.head[-1] if hasattr(policy, "actor") else policy.action_net

@@ -11,8 +11,9 @@ import pytest
 from outlap.drivers.function import FunctionDriver
 from outlap.drivers.ghost import COLUMNS, PREVIEW, Ghost
 from outlap.drivers.pure_pursuit import PurePursuit
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.observations import observe
-from outlap.envs.race_config import RaceConfig
+from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 from outlap.evaluation.recording import record_lap
@@ -43,8 +44,8 @@ def circle_lap(points: int = 200) -> np.ndarray:
 
 def driven(ghost: Ghost, seconds: float, **start) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Radius [m], angle about the ring's middle and speed [m/s] of a ghost's cars, before every step: (steps, 8)."""
-    task = TASK.model_copy(update={"observation": ghost.observation_terms})
-    env = RaceVectorEnv(8, **{**dict(task), "tracks": [ring(RADIUS)], "start": start})
+    changes = {"observation": ghost.observation_terms, "start": StartConfig.model_validate(start)}
+    env = RaceVectorEnv(8, TASK.model_copy(update=changes), [ring(RADIUS)])
     observation, _ = env.reset(seed=0)
     seen = []
     for _ in range(round(seconds / ACTION)):
@@ -180,6 +181,6 @@ def test_a_broken_file_is_named(tmp_path: Path, content: str | None, message: st
 
 def test_it_asks_for_what_it_needs_and_for_no_scan() -> None:
     ghost = Ghost(circle_lap())
-    env = RaceVectorEnv(2, tracks=[ring(RADIUS)], beams=0)
+    env = make_race_vector(2, tracks=[ring(RADIUS)], beams=0)
     env.reset(seed=0)
     assert ghost.act(observe(env.race, 0, ghost.observation_terms, ghost.scale_observations)).shape == (2, 2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from outlap.envs.actions import commands, speed_spans
-from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.keywords import make_race_vector
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
 
 
@@ -47,7 +47,7 @@ def test_every_car_has_its_own_limits():
 
 def test_steering_left_turns_left_and_full_speed_is_the_vehicles(big_circle, put):
     """End to end: action (1, 1) goes to the left stop; the car settles at v_max of the paper's vehicle."""
-    env = RaceVectorEnv(2, tracks=[big_circle], beams=0, vehicle="paper")
+    env = make_race_vector(2, tracks=[big_circle], beams=0, vehicle="paper")
     put(env, [0.0, 0.0, 0.0, 7.9])
     yaw = env.race.worlds.state[:, 0, 4].copy()
     for _ in range(15):
@@ -61,7 +61,7 @@ def test_steering_left_turns_left_and_full_speed_is_the_vehicles(big_circle, put
 
 
 def test_actions_beyond_one_are_clipped(ellipse):
-    envs = [RaceVectorEnv(1, tracks=[ellipse], beams=0, observation="previous_action") for _ in range(2)]
+    envs = [make_race_vector(1, tracks=[ellipse], beams=0, observation="previous_action") for _ in range(2)]
     seen = []
     for env, action in zip(envs, ([[3.0, -7.0]], [[1.0, -1.0]]), strict=True):
         env.reset(seed=0)

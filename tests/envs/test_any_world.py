@@ -12,12 +12,9 @@ from hypothesis import event, given
 from hypothesis import strategies as st
 
 from any_worlds import FIELDS, campaign, car_config, circuits, oddities, shares, value_at
+from outlap.envs.keywords import make_parallel, make_race, make_race_vector, make_sb3
 from outlap.envs.observations import OBSERVATION_TERMS
-from outlap.envs.parallel_env import RaceParallelEnv
-from outlap.envs.race_env import RaceEnv
-from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_PRESETS, REWARD_TERMS
-from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.errors import OutlapError
 from outlap.planning.path import path_along
 from outlap.simulator.simulator import MODELS
@@ -80,7 +77,7 @@ def test_what_is_told_is_finite_within_the_spaces_and_ends_by_the_rules(lines_at
     @given(races(), st.integers(0, 2**32), st.lists(st.tuples(numbers, numbers), min_size=1, max_size=12))
     def race(config: dict[str, Any], seed: int, actions: list[tuple[float, float]]) -> None:
         tracks = [circuits()[number] for number in config["tracks"]]
-        env = RaceVectorEnv(WORLDS, **{**config, "tracks": tracks})
+        env = make_race_vector(WORLDS, **{**config, "tracks": tracks})
         try:
             env.reset(seed=seed)
         except OutlapError as error:
@@ -132,8 +129,8 @@ NONSENSE = [
 @pytest.mark.parametrize("action", NONSENSE, ids=[f"{each!r:.24}" for each in NONSENSE])
 def test_an_action_that_is_none_is_refused_by_every_environment_and_changes_nothing(circle, action):
     config = {"tracks": [circle], "beams": 3}
-    many, one, stable = RaceVectorEnv(1, **config), RaceEnv(**config), SB3VecEnv(1, **config)
-    agents = RaceParallelEnv(2, **config)
+    many, one, stable = make_race_vector(1, **config), make_race(**config), make_sb3(1, **config)
+    agents = make_parallel(2, **config)
     for env in (many, one, agents):
         env.reset(seed=0)
     stable.reset()
@@ -155,7 +152,7 @@ def test_an_action_that_is_none_is_refused_by_every_environment_and_changes_noth
 def test_an_action_however_large_is_clipped_by_every_environment(circle, action):
     config = {"tracks": [circle], "beams": 0, "observation": ["previous_action"]}
     many, one, stable, agents = (
-        RaceVectorEnv(1, **config), RaceEnv(**config), SB3VecEnv(1, **config), RaceParallelEnv(2, **config)
+        make_race_vector(1, **config), make_race(**config), make_sb3(1, **config), make_parallel(2, **config)
     )  # fmt: skip
     for env in (many, one, stable, agents):
         env.reset()

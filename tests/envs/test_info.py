@@ -7,14 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
+from outlap.envs.episodes import EPISODE_FIELDS
+from outlap.envs.keywords import make_race_vector
 from outlap.simulator.vehicle import N_PARAMS, to_values
 
 
 def test_the_final_infos_numbers(ellipse, follow):
     """Against sums kept here, over whole episodes in which the ego brakes and wobbles."""
     worlds, interval = 3, 4
-    env = RaceVectorEnv(
+    env = make_race_vector(
         worlds, tracks=[ellipse], beams=0, control_interval=interval, termination={"time_limit": 2.0},
         start={"speed": 2.0},
     )  # fmt: skip
@@ -59,7 +60,7 @@ def test_the_final_infos_numbers(ellipse, follow):
 
 
 def test_the_impact_speed_of_a_crash(ellipse, put):
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0)
+    env = make_race_vector(1, tracks=[ellipse], beams=0)
     put(env, [0.0, 0.0, 1.4, 5.0])
     speeds = []
     info: dict = {}
@@ -73,7 +74,7 @@ def test_the_impact_speed_of_a_crash(ellipse, put):
 
 def test_laps_are_timed_from_line_to_line(circle, put, follow):
     """Against crossings interpolated here from poses alone; the out-lap does not count."""
-    env = RaceVectorEnv(1, tracks=[circle], beams=0, observation="pose", termination={"stall_time": 0.0})
+    env = make_race_vector(1, tracks=[circle], beams=0, observation="pose", termination={"stall_time": 0.0})
     length = circle.centerline.length
     put(env, [length - 3.0, 0.0, 0.0, 4.0])
     angle = -3.0 / 4.0
@@ -102,7 +103,7 @@ def test_laps_are_timed_from_line_to_line(circle, put, follow):
 
 def test_reversing_over_the_line_completes_no_lap(circle, put):
     """Half a metre before it and half a metre behind it, three times each."""
-    env = RaceVectorEnv(1, tracks=[circle], beams=0, termination={"stall_time": 0.0})
+    env = make_race_vector(1, tracks=[circle], beams=0, termination={"stall_time": 0.0})
     put(env, [0.5, 0.0, 0.0, 0.0])
     for speed_action, there in 3 * [(-0.75, -1.0), (-0.45, 0.0)]:  # 1.9 m/s either way
         progress = -0.5
@@ -116,7 +117,7 @@ def test_reversing_over_the_line_completes_no_lap(circle, put):
 
 def test_info_tells_the_task(ellipse, circle):
     """The track, every car's parameters and the opponents' speeds, as the simulator has them."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         5, tracks=[ellipse, circle], num_cars=2, beams=0, vehicle={"mu": (0.5, 1.1)}, opponent_speed=(1.0, 4.0)
     )
     _, info = env.reset(seed=0)
@@ -132,7 +133,7 @@ def test_info_tells_the_task(ellipse, circle):
 
 def test_opponents_follow_the_track_at_their_own_speed(ellipse, circle, big_circle, put):
     """The ego stands half a lap away. They come round without a crash, no faster than their top speed."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         6, tracks=[ellipse, circle, big_circle], num_cars=3, beams=0, opponent_speed=(1.0, 3.0),
         termination={"stall_time": 0.0, "time_limit": 0.0},
     )  # fmt: skip

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.observations import CURVATURE_AHEAD, LINE_AHEAD, OBSERVATION_TERMS
-from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 from outlap.simulator.lidar import beam_directions
 
@@ -19,7 +19,7 @@ ALL = tuple(OBSERVATION_TERMS)
 @pytest.fixture(scope="module")
 def driven(ellipse, follow):
     """Eight worlds after a second of wobbly driving: (env, observation, the last action)."""
-    env = RaceVectorEnv(8, tracks=[ellipse], beams=31, observation=ALL, control_interval=5, start={"speed": 2.0})
+    env = make_race_vector(8, tracks=[ellipse], beams=31, observation=ALL, control_interval=5, start={"speed": 2.0})
     env.reset(seed=3)
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -30,7 +30,7 @@ def driven(ellipse, follow):
 
 
 def test_the_default_observation_is_the_papers(ellipse):
-    env = RaceVectorEnv(2, tracks=[ellipse])
+    env = make_race_vector(2, tracks=[ellipse])
     assert isinstance(env.single_observation_space, gym.spaces.Dict)
     assert set(env.single_observation_space.spaces) == {"scan", "pose", "vel", "heading"}
     observation, _ = env.reset(seed=0)
@@ -52,7 +52,7 @@ def test_pose_velocity_and_angles_come_from_the_state(driven):
 
 def test_velocity_is_how_fast_the_pose_changes(ellipse, follow):
     """Without the state's columns: the difference quotient of the pose, turned into the car's frame."""
-    env = RaceVectorEnv(4, tracks=[ellipse], beams=0, start={"speed": 3.0})
+    env = make_race_vector(4, tracks=[ellipse], beams=0, start={"speed": 3.0})
     env.reset(seed=1)
     poses, vels = [], []
     for _ in range(40):
@@ -107,7 +107,7 @@ def test_frenet_agrees_with_the_projection_on_the_spline(driven, ellipse):
 
 
 def test_left_of_the_line_and_turned_left_are_positive(ellipse, put):
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, observation="frenet")
+    env = make_race_vector(1, tracks=[ellipse], beams=0, observation="frenet")
     put(env, [3.0, 0.4, 0.2, 0.0])
     observation, *_ = env.step(np.array([[0.0, -0.6]]))  # -0.6 is standstill
     np.testing.assert_allclose(observation["frenet"], [[0.4, 0.2]], atol=1e-3)
@@ -115,7 +115,7 @@ def test_left_of_the_line_and_turned_left_are_positive(ellipse, put):
 
 def test_curvature_ahead_is_that_of_the_ellipse(ellipse, put):
     """At the parameter t of (a cos t, b sin t): curvature = a b / (a² sin² t + b² cos² t)^1.5."""
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, observation="curvature_ahead")
+    env = make_race_vector(1, tracks=[ellipse], beams=0, observation="curvature_ahead")
     fine = np.linspace(0.0, 2.0 * math.pi, 200_001)
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(np.stack([9 * np.cos(fine), 5 * np.sin(fine)]), axis=1))))
     assert ellipse.centerline.length == pytest.approx(length[-1], rel=1e-6)
@@ -130,7 +130,7 @@ def test_curvature_ahead_is_that_of_the_ellipse(ellipse, put):
 
 def test_the_scan_runs_from_right_to_left(ellipse, put):
     """Close to the left wall of a nearly straight place: short ranges come last."""
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=3, observation="scan", field_of_view=math.pi)
+    env = make_race_vector(1, tracks=[ellipse], beams=3, observation="scan", field_of_view=math.pi)
     quarter = ellipse.centerline.length / 4  # the flattest place, heading in -x
     put(env, [quarter, 0.6, 0.0, 0.0])
     scan = env.step(np.array([[0.0, -0.6]]))[0]["scan"][0]
@@ -141,7 +141,7 @@ def test_the_scan_runs_from_right_to_left(ellipse, put):
 
 @pytest.mark.parametrize("beams", [0, 1, 7, 1080])
 def test_any_number_of_beams(ellipse, beams):
-    env = RaceVectorEnv(2, tracks=[ellipse], beams=beams)
+    env = make_race_vector(2, tracks=[ellipse], beams=beams)
     observation, _ = env.reset(seed=0)
     assert observation["scan"].shape == (2, beams)
     observation = env.step(np.zeros((2, 2)))[0]
@@ -152,7 +152,7 @@ def test_any_number_of_beams(ellipse, beams):
 @pytest.mark.parametrize("scaled", [False, True])
 def test_observations_stay_in_their_space(ellipse, scaled):
     """Random driving, crashes, reverse, awkward ranges and a scanner that is wrong in every way."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         8, tracks=[ellipse], num_cars=2, beams=40, observation=ALL, scale_observations=scaled, control_interval=4,
         lidar={"max_range": (2.9, 6.7), "noise_std": 0.3, "bias": (-0.5, 0.5), "dropout": 0.1, "mount_x": 0.2},
         termination={"time_limit": 1.5},
@@ -174,7 +174,7 @@ def test_observations_stay_in_their_space(ellipse, scaled):
 def test_the_farthest_range_is_the_spaces_end_whatever_it_is(ellipse):
     """A beam that drops out reads exactly max_range; dividing it by the scale must not leave the space."""
     for farthest in np.random.default_rng(0).uniform(1.0, 40.0, 60):
-        env = RaceVectorEnv(
+        env = make_race_vector(
             1, tracks=[ellipse], beams=3, observation="scan", scale_observations=True,
             lidar={"max_range": farthest, "dropout": 1.0},
         )  # fmt: skip
@@ -185,7 +185,7 @@ def test_the_farthest_range_is_the_spaces_end_whatever_it_is(ellipse):
 
 def test_scaling_divides_by_the_declared_constants(ellipse):
     plain, scaled = (
-        RaceVectorEnv(3, tracks=[ellipse], beams=9, observation=ALL, scale_observations=on) for on in (False, True)
+        make_race_vector(3, tracks=[ellipse], beams=9, observation=ALL, scale_observations=on) for on in (False, True)
     )
     plain.reset(seed=5)
     scaled.reset(seed=5)
@@ -212,25 +212,25 @@ def test_scaling_divides_by_the_declared_constants(ellipse):
 
 
 def test_terms_come_in_the_order_asked_for_and_one_name_is_enough(ellipse):
-    env = RaceVectorEnv(1, tracks=[ellipse], observation=("vel", "scan"), beams=4)
+    env = make_race_vector(1, tracks=[ellipse], observation=("vel", "scan"), beams=4)
     assert set(env.reset(seed=0)[0]) == {"vel", "scan"}
-    assert set(RaceVectorEnv(1, tracks=[ellipse], observation="vel").reset(seed=0)[0]) == {"vel"}
+    assert set(make_race_vector(1, tracks=[ellipse], observation="vel").reset(seed=0)[0]) == {"vel"}
 
 
 def test_an_unknown_term_is_refused_with_the_names_that_exist(ellipse):
     with pytest.raises(OutlapError, match=r"observation.*'speed'.*scan, pose, vel") as caught:
-        RaceVectorEnv(1, tracks=[ellipse], observation=("scan", "speed"))
+        make_race_vector(1, tracks=[ellipse], observation=("scan", "speed"))
     assert "\n" not in str(caught.value)
     for wrong in ((), ("vel", "vel")):
         with pytest.raises(OutlapError, match="observation"):
-            RaceVectorEnv(1, tracks=[ellipse], observation=wrong)
+            make_race_vector(1, tracks=[ellipse], observation=wrong)
 
 
 def test_the_ego_sees_only_its_own_car(ellipse, put):
     """Another car changes nothing but the beams that it blocks."""
     starts = np.array([[5.0, 0.1, 0.05, 2.0], [0.0, 0.0, 0.0, 2.0]])
-    one = RaceVectorEnv(3, tracks=[ellipse], beams=61, observation=ALL)
-    two = RaceVectorEnv(3, tracks=[ellipse], beams=61, observation=ALL, num_cars=2, opponent_speed=3.0)
+    one = make_race_vector(3, tracks=[ellipse], beams=61, observation=ALL)
+    two = make_race_vector(3, tracks=[ellipse], beams=61, observation=ALL, num_cars=2, opponent_speed=3.0)
     for away, seen in ((-2.0, False), (2.5, True)):
         starts[1, 0] = starts[0, 0] + away
         put(one, starts[:1])
@@ -262,7 +262,7 @@ def test_as_many_nearby_cars_are_told_of_as_configured(big_circle, put):
     starts = np.array([[10.0, 0.0, 0.0, 2.0], [14.0, 0.3, 0.0, 1.0], [7.0, 0.0, 0.1, 0.0], [20.0, 0.0, 0.0, 0.0]])
     told = {}
     for count in (1, 4):
-        env = RaceVectorEnv(
+        env = make_race_vector(
             1, tracks=[big_circle], num_cars=4, beams=0, nearby_cars=count, observation=("nearby_cars",)
         )
         put(env, starts)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from outlap.drivers import Driver
-from outlap.envs.opponents import Opponents
-from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.keywords import make_race_vector
 from outlap.errors import OutlapError
 
 
@@ -31,24 +30,18 @@ class Scripted(Driver):
 
 def field(track, *drivers, num_envs: int = 64, num_cars: int = 3, noise=0.0, speed=(1.0, 3.0), seed: int = 0):
     """An environment whose opponents are these drivers."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         num_envs, tracks=[track], num_cars=num_cars, beams=0, termination={"stall_time": 0.0, "time_limit": 0.0},
-        start={"gap": (6.0, 6.0)},
+        start={"gap": (6.0, 6.0)}, opponents=drivers, opponent_speed=speed, opponent_noise=noise,
     )  # fmt: skip
-    env._opponents = Opponents(drivers, env.race, speed, noise)
     env.reset(seed=seed)
     return env
-
-
-def opponents(env: RaceVectorEnv) -> Opponents:
-    assert env._opponents is not None
-    return env._opponents
 
 
 def test_every_driver_drives_its_own_cars_and_is_asked_once_a_step(big_circle):
     left, right = Scripted("left", (0.5, -1.0)), Scripted("right", (-0.5, -1.0))
     env = field(big_circle, left, right)
-    number = opponents(env).number.copy()
+    number = env.opponents.number.copy()
     assert 0.3 < number.mean() < 0.7
     env.step(np.zeros((64, 2)))
     np.testing.assert_array_equal(env.race.actions[:, 1:, 0], np.where(number == 0, 0.5, -0.5))
@@ -58,15 +51,15 @@ def test_every_driver_drives_its_own_cars_and_is_asked_once_a_step(big_circle):
 def test_drivers_and_speeds_are_drawn_anew_at_a_reset_and_repeat_with_the_seed(big_circle):
     drivers = [Scripted(name, (0.0, -1.0)) for name in "abc"]
     env = field(big_circle, *drivers)
-    first = opponents(env).number.copy(), opponents(env).top_speed.copy()
+    first = env.opponents.number.copy(), env.opponents.top_speed.copy()
     assert set(np.unique(first[0])) == {0, 1, 2}
     assert first[1].min() >= 1.0
     assert first[1].max() <= 3.0
     env.reset()
-    assert (opponents(env).number != first[0]).any()
+    assert (env.opponents.number != first[0]).any()
     again = field(big_circle, *drivers)
-    np.testing.assert_array_equal(opponents(again).number, first[0])
-    np.testing.assert_array_equal(opponents(again).top_speed, first[1])
+    np.testing.assert_array_equal(again.opponents.number, first[0])
+    np.testing.assert_array_equal(again.opponents.top_speed, first[1])
 
 
 def test_a_driver_hears_whose_episode_begins(big_circle):
@@ -113,15 +106,15 @@ def test_a_driver_that_gives_nonsense_is_named(big_circle, action, message):
 
 
 def test_opponents_are_chosen_by_name(big_circle):
-    env = RaceVectorEnv(
+    env = make_race_vector(
         32, tracks=[big_circle], num_cars=3, beams=54, opponents=("pure-pursuit", "follow-the-gap"),
         opponent_speed=2.0, start={"gap": (6.0, 6.0)},
     )  # fmt: skip
     env.reset(seed=0)
     for _ in range(200):
         env.step(np.tile([0.1, -0.6], (32, 1)))
-    assert {driver.name for driver in opponents(env).drivers} == {"pure-pursuit", "follow-the-gap"}
+    assert {driver.name for driver in env.opponents.drivers} == {"pure-pursuit", "follow-the-gap"}
     driven = env.race.worlds.state[:, 1:, 3]
     assert np.median(driven) > 1.0
     with pytest.raises(OutlapError, match="driver is 'stig'"):
-        RaceVectorEnv(2, tracks=[big_circle], num_cars=2, opponents="stig")
+        make_race_vector(2, tracks=[big_circle], num_cars=2, opponents="stig")

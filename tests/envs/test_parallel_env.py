@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
+from outlap.envs.keywords import make_parallel, make_race_vector
 from outlap.envs.parallel_env import RaceParallelEnv
-from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_TERMS
 from outlap.errors import OutlapError
 
@@ -20,7 +20,7 @@ def drive(env: RaceParallelEnv, actions: dict[str, list[float]], steps: int) -> 
 
 def test_pettingzoo_finds_nothing(ellipse):
     def build():
-        return RaceParallelEnv(3, tracks=[ellipse], beams=11, termination=LIMITS, lidar={"noise_std": 0.1})
+        return make_parallel(3, tracks=[ellipse], beams=11, termination=LIMITS, lidar={"noise_std": 0.1})
 
     parallel_api_test(build(), num_cycles=200)
     parallel_seed_test(build, num_cycles=50)
@@ -33,8 +33,8 @@ def test_it_is_the_race_of_the_vector_environment(ellipse, put):
     def opponent(observation) -> np.ndarray:
         return np.tile(np.array([0.15, 0.0]), (len(observation["scan"]), 1))
 
-    single = RaceVectorEnv(1, opponents=[opponent], **config)
-    every = RaceParallelEnv(**config)
+    single = make_race_vector(1, opponents=[opponent], **config)
+    every = make_parallel(**config)
     observation, _ = single.reset(seed=4)
     observations, _ = every.reset(seed=4)
     for _ in range(15):
@@ -50,7 +50,7 @@ def test_it_is_the_race_of_the_vector_environment(ellipse, put):
 
 
 def test_a_crash_ends_the_race_of_its_own_car_only(big_circle):
-    env = RaceParallelEnv(3, tracks=[big_circle], beams=0, speed_range=(0.0, 8.0), start={"heading_error": 0.0})
+    env = make_parallel(3, tracks=[big_circle], beams=0, speed_range=(0.0, 8.0), start={"heading_error": 0.0})
     env.reset(seed=0)
     actions = {"car_0": [1.0, 0.0], "car_1": [0.0, -1.0], "car_2": [0.0, -1.0]}
     for _ in range(200):
@@ -68,7 +68,7 @@ def test_a_crash_ends_the_race_of_its_own_car_only(big_circle):
 
 @pytest.mark.parametrize(("what", "seen"), [("park", True), ("remove", False)])
 def test_a_wreck_stays_or_goes_as_configured(big_circle, what, seen):
-    env = RaceParallelEnv(
+    env = make_parallel(
         2, tracks=[big_circle], beams=0, speed_range=(0.0, 8.0), opponent_crash=what, observation="nearby_cars",
         termination={"stall_time": 0.0},
     )  # fmt: skip
@@ -80,7 +80,7 @@ def test_a_wreck_stays_or_goes_as_configured(big_circle, what, seen):
 
 
 def test_a_car_that_stalls_is_truncated_and_leaves_the_track(big_circle):
-    env = RaceParallelEnv(
+    env = make_parallel(
         2, tracks=[big_circle], beams=0, speed_range=(0.0, 8.0), observation="nearby_cars",
         termination={"stall_time": 1.0}, start={"heading_error": 0.0, "gap": (6.0, 6.0)},
     )  # fmt: skip
@@ -93,7 +93,7 @@ def test_a_car_that_stalls_is_truncated_and_leaves_the_track(big_circle):
 
 
 def test_every_car_is_told_its_place_and_rewarded_for_overtaking(big_circle):
-    env = RaceParallelEnv(
+    env = make_parallel(
         2, tracks=[big_circle], beams=0, speed_range=(0.0, 8.0), termination={"time_limit": 0.0, "stall_time": 0.0},
         reward={"weights": {**dict.fromkeys(REWARD_TERMS, 0.0), "overtake": 20.0, "overtaken": 20.0}},
     )  # fmt: skip
@@ -121,7 +121,7 @@ def test_every_car_is_told_its_place_and_rewarded_for_overtaking(big_circle):
     ],
 )
 def test_wrong_actions_are_named(ellipse, actions, message):
-    env = RaceParallelEnv(2, tracks=[ellipse], beams=0)
+    env = make_parallel(2, tracks=[ellipse], beams=0)
     env.reset(seed=0)
     with pytest.raises(OutlapError, match=message):
         env.step(actions)
@@ -133,4 +133,4 @@ def test_wrong_actions_are_named(ellipse, actions, message):
 )
 def test_what_a_race_of_agents_has_no_use_for_is_refused(ellipse, config, message):
     with pytest.raises(OutlapError, match=message):
-        RaceParallelEnv(2, tracks=[ellipse], **config)
+        make_parallel(2, tracks=[ellipse], **config)

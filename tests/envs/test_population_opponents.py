@@ -10,6 +10,7 @@ import pytest
 
 from outlap.drivers.population import load_population
 from outlap.drivers.pure_pursuit import PurePursuit
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.observations import observe
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
@@ -26,7 +27,7 @@ STILL = np.tile([0.0, -1.0], (NUM_ENVS, 1))
 def race(track: Track, opponents: Any, **config: Any) -> RaceVectorEnv:
     """An environment against these opponents, begun."""
     settings = {"num_cars": 3, "beams": 24, "speed_range": (0.0, 6.0), "start": APART, "termination": ENDLESS}
-    env = RaceVectorEnv(NUM_ENVS, tracks=[track], opponents=opponents, **{**settings, **config})
+    env = make_race_vector(NUM_ENVS, tracks=[track], opponents=opponents, **{**settings, **config})
     env.reset(seed=0)
     return env
 
@@ -43,7 +44,7 @@ def straight(observation: dict[str, np.ndarray]) -> np.ndarray:
 def test_a_populations_folder_gives_opponents_of_its_training_half(big_circle, tmp_path: Path) -> None:
     folder = population(tmp_path, "train", "held_out", "train")
     env = race(big_circle, str(folder))
-    assert env.opponent_names() == ["ring-2.0", "ring-4.0"]
+    assert [driver.name for driver in env.opponents.drivers] == ["ring-2.0", "ring-4.0"]
     assert drawn(env) == {"ring-2.0", "ring-4.0"}
     assert env.config.opponents == (str(folder),)
     assert drawn(race(big_circle, folder, opponent_split="held_out")) == {"ring-3.0"}
@@ -61,7 +62,7 @@ def test_each_car_gets_the_action_of_the_member_that_drives_it(big_circle, tmp_p
     env = race(big_circle, folder)
     members = {each.name: each for each in load_population(folder)}
     for _ in range(3):
-        names = env._info()["opponents"]
+        names = env.opponents.names()
         assert len(set(names.ravel())) == 3
         expected = np.empty((NUM_ENVS, 2, 2))
         for car in (1, 2):
@@ -128,7 +129,7 @@ def test_opponents_are_objects_and_functions_too_and_the_configuration_has_their
     env = race(big_circle, [PurePursuit(speed_share=0.5, name="slow"), straight, driver(name="looker"), "pure-pursuit"])
     assert env.config.opponents == ("slow", "straight", "looker", "pure-pursuit")
     assert drawn(env) == {"slow", "straight", "looker", "pure-pursuit"}
-    names = env._info()["opponents"]
+    names = env.opponents.names()
     env.step(STILL)
     its_own = env.race.actions[:, 1:][names == "straight"]
     np.testing.assert_allclose(its_own, np.tile([0.0, -0.8], (len(its_own), 1)), atol=1e-6)
@@ -160,7 +161,7 @@ def test_the_info_names_opponents_and_task(big_circle) -> None:
     expected = [f"ring8 against {', '.join(sorted(names))}" for names in info["opponents"]]
     assert info["task"].tolist() == expected
     assert set(expected) == {"ring8 against a, a", "ring8 against a, b", "ring8 against b, b"}
-    alone = RaceVectorEnv(2, tracks=[big_circle], beams=0)
+    alone = make_race_vector(2, tracks=[big_circle], beams=0)
     _, info = alone.reset(seed=0)
     assert info["task"].tolist() == ["ring8", "ring8"]
     assert info["opponents"].shape == (2, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_TERMS
 
@@ -14,7 +15,7 @@ NO_LIMITS = {"time_limit": 0.0, "stall_time": 0.0}
 
 
 def duel(track, opponent_speed: float, num_cars: int = 2, **config) -> RaceVectorEnv:
-    return RaceVectorEnv(
+    return make_race_vector(
         1, tracks=[track], num_cars=num_cars, beams=0, control_interval=2, opponent_speed=opponent_speed,
         speed_range=(0.0, 10.0), reward=OVERTAKE_ONLY, termination=NO_LIMITS, **config,
     )  # fmt: skip
@@ -124,7 +125,7 @@ def test_places_change_only_by_a_cars_length(big_circle, put):
 
 def test_the_order_at_the_start_is_the_order_on_the_track(big_circle):
     """On the grid around the start line, whoever the draw puts in front: no car has gained a place by step one."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         60, tracks=[big_circle], num_cars=3, beams=0, start={"anywhere": False}, reward=OVERTAKE_ONLY,
         speed_range=(0.0, 10.0), opponent_speed=0.0,
     )  # fmt: skip

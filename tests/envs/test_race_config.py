@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from outlap.config import load_config, save_config
+from outlap.envs.keywords import make_race, make_race_vector
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.race_env import RaceEnv
-from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_PRESETS
 from outlap.errors import OutlapError
 from outlap.simulator.vehicle import to_records
@@ -19,7 +18,7 @@ from outlap.simulator.vehicle import to_records
 
 def test_the_papers_vehicle(ellipse):
     """SYSTEM §1."""
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, vehicle="paper")
+    env = make_race_vector(1, tracks=[ellipse], beams=0, vehicle="paper")
     vehicle = env.config.vehicle.model_dump()
     expected = {
         "mu": 0.8, "C_Sf": 4.718, "C_Sr": 5.4562, "lf": 0.15875, "lr": 0.17145, "h": 0.074, "m": 3.74, "I": 0.04712,
@@ -33,7 +32,7 @@ def test_the_papers_vehicle(ellipse):
 
 
 def test_a_preset_with_changes(ellipse):
-    env = RaceVectorEnv(
+    env = make_race_vector(
         64, tracks=[ellipse], beams=0,
         vehicle={"preset": "paper", "mu": {"min": 0.5, "max": 1.1}, "m": 4.0, "tyre": {"p_dy1": 0.9}},
     )  # fmt: skip
@@ -49,13 +48,13 @@ def test_a_preset_with_changes(ellipse):
 
 
 def test_the_default_vehicle_is_the_f1tenth_gyms(ellipse):
-    vehicle = RaceVectorEnv(1, tracks=[ellipse], beams=0).config.vehicle
+    vehicle = make_race_vector(1, tracks=[ellipse], beams=0).config.vehicle
     assert (vehicle.mu, vehicle.a_max, vehicle.v_min, vehicle.v_max) == (1.0489, 9.51, -5.0, 20.0)
 
 
 def test_the_papers_reward_by_name(ellipse):
-    by_name = RaceVectorEnv(1, tracks=[ellipse], beams=0, reward="paper").config.reward
-    assert by_name == RaceVectorEnv(1, tracks=[ellipse], beams=0, reward={"preset": "paper"}).config.reward
+    by_name = make_race_vector(1, tracks=[ellipse], beams=0, reward="paper").config.reward
+    assert by_name == make_race_vector(1, tracks=[ellipse], beams=0, reward={"preset": "paper"}).config.reward
     assert by_name.resolved() == {name: w for name, w in REWARD_PRESETS["paper"].items() if w}
 
 
@@ -78,11 +77,11 @@ def test_it_survives_a_file(tmp_path):
 
 def test_a_saved_configuration_makes_the_same_environment(ellipse, circle):
     """Its dump as keywords: same draws, same observations."""
-    first = RaceVectorEnv(
+    first = make_race_vector(
         3, tracks=[ellipse, circle], beams=5, vehicle={"preset": "paper", "mu": (0.5, 1.1)}, lidar={"noise_std": 0.1}
     )
     keywords: Any = first.config.model_dump(mode="json") | {"tracks": [ellipse, circle]}
-    second = RaceVectorEnv(3, **keywords)
+    second = make_race_vector(3, **keywords)
     a, b = first.reset(seed=1)[0], second.reset(seed=1)[0]
     for name in a:
         np.testing.assert_array_equal(a[name], b[name])
@@ -134,7 +133,7 @@ WRONG = [
 @pytest.mark.parametrize(("keywords", "words"), WRONG, ids=[str(keywords) for keywords, _ in WRONG])
 def test_what_is_wrong_is_said_in_one_line(ellipse, keywords, words):
     """By the vector environment and the single one alike."""
-    for make in (lambda **given: RaceVectorEnv(2, **given), RaceEnv):
+    for make in (lambda **given: make_race_vector(2, **given), make_race):
         with pytest.raises(OutlapError, match=words) as caught:
             make(tracks=[ellipse], **({"beams": 0} | keywords))
         assert "\n" not in str(caught.value)
@@ -143,16 +142,16 @@ def test_what_is_wrong_is_said_in_one_line(ellipse, keywords, words):
 @pytest.mark.parametrize("num_envs", [0, -1, 1.5, "two", None])
 def test_a_wrong_number_of_worlds(ellipse, num_envs):
     with pytest.raises(OutlapError, match="num_envs is"):
-        RaceVectorEnv(num_envs, tracks=[ellipse], beams=0)
+        make_race_vector(num_envs, tracks=[ellipse], beams=0)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "sometimes", gym.vector.AutoresetMode.NEXT_STEP, None])
 def test_a_mode_of_autoreset_that_is_not_offered(ellipse, mode):
     with pytest.raises(OutlapError, match=r"autoreset_mode is .*SAME_STEP and DISABLED"):
-        RaceVectorEnv(1, tracks=[ellipse], beams=0, autoreset_mode=mode)
+        make_race_vector(1, tracks=[ellipse], beams=0, autoreset_mode=mode)
 
 
 @pytest.mark.parametrize("name", ["num_envs", "autoreset_mode"])
 def test_a_single_race_has_no_batch(ellipse, name):
     with pytest.raises(OutlapError, match=name):
-        RaceEnv(tracks=[ellipse], beams=0, **{name: 2})  # type: ignore[arg-type]
+        make_race(tracks=[ellipse], beams=0, **{name: 2})  # type: ignore[arg-type]

@@ -15,8 +15,10 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 
 from outlap.drivers.centerline_follower import CenterlineFollower
+from outlap.envs.episodes import EPISODE_FIELDS
+from outlap.envs.keywords import make_race
 from outlap.envs.race_env import RaceEnv
-from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
+from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.racing_line import LINE_SPEED
 from outlap.errors import OutlapError
 from outlap.simulator.atlas import FIRST_ROW, ROWS
@@ -145,7 +147,7 @@ def test_an_environment_can_be_made_from_its_own_spec(ellipse):
 
 
 def test_stepping_needs_a_reset_at_the_beginning_and_after_the_end(ellipse):
-    env = RaceEnv(tracks=[ellipse], beams=0, termination={"time_limit": 0.02})
+    env = make_race(tracks=[ellipse], beams=0, termination={"time_limit": 0.02})
     with pytest.raises(OutlapError, match="reset"):
         env.step(np.zeros(2))
     env.reset(seed=0)
@@ -169,7 +171,7 @@ def test_stepping_needs_a_reset_at_the_beginning_and_after_the_end(ellipse):
     ],
 )
 def test_wrong_actions_are_refused(ellipse, action, words):
-    env = RaceEnv(tracks=[ellipse], beams=0)
+    env = make_race(tracks=[ellipse], beams=0)
     env.reset(seed=0)
     with pytest.raises(OutlapError, match=words):
         env.step(np.array(action))
@@ -178,7 +180,7 @@ def test_wrong_actions_are_refused(ellipse, action, words):
 def test_lap_times_come_into_the_info_with_the_first_lap(circle):
     driver = CenterlineFollower(speed_action=-0.28)  # 4 m/s around the circle of 4 m radius
     start = {"anywhere": False, "speed": 4.0, "offset": 0.0}
-    env = RaceEnv(tracks=[circle], beams=0, control_interval=10, start=start, observation=driver.observation_terms)
+    env = make_race(tracks=[circle], beams=0, control_interval=10, start=start, observation=driver.observation_terms)
     observation, _ = env.reset(seed=0)
     for _ in range(80):
         action = driver.act({name: value[None] for name, value in observation.items()})[0]
@@ -190,7 +192,7 @@ def test_lap_times_come_into_the_info_with_the_first_lap(circle):
 
 
 def test_what_is_returned_is_not_a_live_buffer(ellipse):
-    env = RaceEnv(tracks=[ellipse], beams=6, observation=EVERYTHING)
+    env = make_race(tracks=[ellipse], beams=6, observation=EVERYTHING)
     observation, info = env.reset(seed=0)
     kept = {name: value.copy() for name, value in observation.items()}
     vehicle = info["vehicle"].copy()

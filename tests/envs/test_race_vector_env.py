@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from outlap.envs.race_env import RaceEnv
-from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.keywords import make_race, make_race_vector
 from outlap.errors import OutlapError
 
 
@@ -55,8 +54,8 @@ def varied(ellipse, circle, big_circle) -> dict:
 def test_it_is_single_environments_stepped_one_by_one(varied):
     """Same seeds, same trajectories bit for bit, through resets."""
     worlds = 4
-    together = RaceVectorEnv(worlds, **varied)
-    alone = [RaceEnv(**varied) for _ in range(worlds)]
+    together = make_race_vector(worlds, **varied)
+    alone = [make_race(**varied) for _ in range(worlds)]
     observation, info = together.reset(seed=11)
     for world, env in enumerate(alone):
         assert_equal({k: v[world] for k, v in observation.items()}, env.reset(seed=11 + world)[0], f"reset {world}")
@@ -91,7 +90,7 @@ def _of(info: dict, world: int) -> dict:
 
 def test_the_same_seed_gives_the_same_run_again(varied):
     def run(seed):
-        env = RaceVectorEnv(3, **varied)
+        env = make_race_vector(3, **varied)
         out = [env.reset(seed=seed)]
         rng = np.random.default_rng(4)
         out += [env.step(rng.uniform(-1.0, 1.0, (3, 2))) for _ in range(120)]
@@ -108,7 +107,7 @@ def test_the_same_seed_gives_the_same_run_again(varied):
 
 def test_what_is_returned_is_never_a_live_buffer(varied):
     """Neither stepping on nor resetting changes what was returned before."""
-    env = RaceVectorEnv(3, **varied)
+    env = make_race_vector(3, **varied)
     rng = np.random.default_rng(0)
     returned: list[tuple] = [env.reset(seed=0)]
     kept = [copy.deepcopy(returned[0])]
@@ -131,7 +130,7 @@ def test_writing_into_what_is_returned_changes_nothing(varied):
     """The run goes on as if nobody had scribbled over its arrays."""
     runs = []
     for scribble in (False, True):
-        env = RaceVectorEnv(3, **varied)
+        env = make_race_vector(3, **varied)
         rng = np.random.default_rng(0)
         step = env.reset(seed=0)
         run = []
@@ -167,7 +166,7 @@ def _scribble(value) -> None:
 
 def test_the_final_observation_is_the_last_before_the_reset(ellipse, follow):
     """Same step, told apart by the pose: the final one continues the drive, the returned one starts anew."""
-    env = RaceVectorEnv(3, tracks=[ellipse], beams=5, termination={"time_limit": 0.5}, start={"speed": 3.0})
+    env = make_race_vector(3, tracks=[ellipse], beams=5, termination={"time_limit": 0.5}, start={"speed": 3.0})
     observation, _ = env.reset(seed=0)
     for step in range(50):
         before = observation["pose"]
@@ -189,7 +188,7 @@ def test_the_final_observation_is_the_last_before_the_reset(ellipse, follow):
 
 def test_only_the_worlds_that_ended_are_reset(ellipse, put):
     """World 1 starts towards the wall; the others go on undisturbed."""
-    env = RaceVectorEnv(3, tracks=[ellipse], beams=5)
+    env = make_race_vector(3, tracks=[ellipse], beams=5)
     put(env, np.array([[[0.0, 0, 0, 2]], [[0, 0, 1.2, 4]], [[5, 0, 0, 2]]], float))
     for _ in range(60):
         before = env.race.worlds.time.copy()
@@ -210,7 +209,7 @@ def test_only_the_worlds_that_ended_are_reset(ellipse, put):
 
 def test_a_control_interval_is_that_many_physics_steps_of_the_same_action(varied):
     fine, coarse = (
-        RaceVectorEnv(3, **{**varied, "num_cars": 1, "control_interval": n, "termination": {"time_limit": 0.0}})
+        make_race_vector(3, **{**varied, "num_cars": 1, "control_interval": n, "termination": {"time_limit": 0.0}})
         for n in (1, 4)
     )
     fine.reset(seed=8)
@@ -241,7 +240,7 @@ def test_a_control_interval_is_that_many_physics_steps_of_the_same_action(varied
 
 
 def test_seeds_differ_between_worlds_and_episodes(varied):
-    env = RaceVectorEnv(40, **{**varied, "num_cars": 1})
+    env = make_race_vector(40, **{**varied, "num_cars": 1})
     poses, vehicles, tracks = [], [], []
     for _ in range(5):
         observation, info = env.reset(seed=1) if not poses else env.reset()
@@ -259,7 +258,7 @@ def test_seeds_differ_between_worlds_and_episodes(varied):
 
 def test_without_a_seed_the_streams_go_on(varied):
     """A seed starts them anew; no seed draws the next episodes, as autoreset does."""
-    env = RaceVectorEnv(3, **varied)
+    env = make_race_vector(3, **varied)
     first, second = env.reset(seed=9)[0], env.reset()[0]
     assert not np.array_equal(first["pose"], second["pose"])
     assert_equal(env.reset(seed=9)[0], first, "the seed again")
@@ -267,13 +266,13 @@ def test_without_a_seed_the_streams_go_on(varied):
 
 
 def test_unseeded_environments_differ(varied):
-    a, b = (RaceVectorEnv(2, **varied).reset()[0]["pose"] for _ in range(2))
+    a, b = (make_race_vector(2, **varied).reset()[0]["pose"] for _ in range(2))
     assert not np.array_equal(a, b)
     assert not np.array_equal(a[0], a[1])
 
 
 def test_a_list_seeds_world_by_world(varied):
-    env = RaceVectorEnv(3, **varied)
+    env = make_race_vector(3, **varied)
     ranged = env.reset(seed=20)[0]["pose"]
     np.testing.assert_array_equal(env.reset(seed=[20, 21, 22])[0]["pose"], ranged)
     np.testing.assert_array_equal(env.reset(seed=[22, 20, 21])[0]["pose"], ranged[[2, 0, 1]])
@@ -287,7 +286,7 @@ def test_a_list_seeds_world_by_world(varied):
 
 
 def test_a_world_whose_first_seed_is_none_is_random(varied):
-    a, b = (RaceVectorEnv(3, **varied).reset(seed=[1, None, None])[0]["pose"] for _ in range(2))
+    a, b = (make_race_vector(3, **varied).reset(seed=[1, None, None])[0]["pose"] for _ in range(2))
     np.testing.assert_array_equal(a[0], b[0])
     assert not np.array_equal(a[1], a[2])
     assert not np.array_equal(a[1], b[1])
@@ -295,15 +294,15 @@ def test_a_world_whose_first_seed_is_none_is_random(varied):
 
 @pytest.mark.parametrize("seed", [[1, 2], [1, 2, 3, 4], -1, [0, -3, 1], "seven", [0, 1.5, 2]])
 def test_wrong_seeds_are_refused(ellipse, seed):
-    env = RaceVectorEnv(3, tracks=[ellipse], beams=0)
+    env = make_race_vector(3, tracks=[ellipse], beams=0)
     with pytest.raises(OutlapError, match="seed"):
         env.reset(seed=seed)
 
 
 def test_without_autoreset_the_caller_resets_by_mask(varied):
-    env = RaceVectorEnv(3, autoreset_mode="Disabled", **{**varied, "num_cars": 1})
+    env = make_race_vector(3, autoreset_mode="Disabled", **{**varied, "num_cars": 1})
     assert env.metadata["autoreset_mode"] == AutoresetMode.DISABLED
-    assert RaceVectorEnv(1, **varied).metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert make_race_vector(1, **varied).metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     env.reset(seed=0)
     over = np.zeros(3, bool)
     while not over.any():
@@ -322,15 +321,15 @@ def test_without_autoreset_the_caller_resets_by_mask(varied):
 
 @pytest.mark.parametrize("mask", [np.ones(2, bool), np.ones(4, bool), np.ones((3, 1), bool)])
 def test_a_mask_of_a_wrong_shape_is_refused(ellipse, mask):
-    env = RaceVectorEnv(3, tracks=[ellipse], beams=0)
+    env = make_race_vector(3, tracks=[ellipse], beams=0)
     with pytest.raises(OutlapError, match="reset_mask"):
         env.reset(options={"reset_mask": mask})
 
 
 def test_stepping_before_a_reset_is_refused(ellipse):
     with pytest.raises(OutlapError, match="reset"):
-        RaceVectorEnv(2, tracks=[ellipse], beams=0).step(np.zeros((2, 2)))
-    env = RaceVectorEnv(2, tracks=[ellipse], beams=0)
+        make_race_vector(2, tracks=[ellipse], beams=0).step(np.zeros((2, 2)))
+    env = make_race_vector(2, tracks=[ellipse], beams=0)
     env.reset(seed=0, options={"reset_mask": np.array([True, False])})
     with pytest.raises(OutlapError, match=r"world 1.*reset"):
         env.step(np.zeros((2, 2)))
@@ -349,7 +348,7 @@ def test_stepping_before_a_reset_is_refused(ellipse):
     ],
 )
 def test_wrong_actions_are_refused_and_change_nothing(ellipse, actions, words):
-    env = RaceVectorEnv(2, tracks=[ellipse], beams=4)
+    env = make_race_vector(2, tracks=[ellipse], beams=4)
     env.reset(seed=0)
     before = env.race.worlds.state.copy()
     with pytest.raises(OutlapError, match=words) as caught:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_PRESETS, REWARD_TERMS, RewardConfig
 from outlap.errors import OutlapError
@@ -32,7 +33,7 @@ def at(env: RaceVectorEnv, training_steps: int) -> None:
 def test_the_reward_is_the_sum_of_what_the_info_logs(ellipse, follow):
     """With every term on, through resets: each logged total grows by what the reward grew."""
     weights = {name: 0.5 + 0.25 * i for i, name in enumerate(REWARD_TERMS)}
-    env = RaceVectorEnv(
+    env = make_race_vector(
         4, tracks=[ellipse], num_cars=2, beams=0, reward={"weights": weights}, start={"speed": 3.0}, opponent_speed=1.0,
         control_interval=3, termination={"time_limit": 2.5, "stall_time": 1.0},
     )  # fmt: skip
@@ -68,7 +69,7 @@ def test_a_term_counts_with_its_weight(ellipse):
     """Twice the weight, twice the reward; no weight, no entry in the info."""
     rewards = []
     for weight in (1.0, 2.0):
-        env = RaceVectorEnv(2, tracks=[ellipse], beams=0, reward=only(progress=weight))
+        env = make_race_vector(2, tracks=[ellipse], beams=0, reward=only(progress=weight))
         env.reset(seed=0)
         rewards.append([env.step(np.tile([0.0, 0.0], (2, 1)))[1] for _ in range(10)])
         info = env.step(np.zeros((2, 2)))[-1]
@@ -80,7 +81,9 @@ def test_a_term_counts_with_its_weight(ellipse):
 def test_progress_is_metres_and_lap_progress_laps_along_the_line(circle, put, follow):
     """Over the start line too: two laps of 2 pi 4 m, measured by the angle of the car's position."""
     metres, laps = (
-        RaceVectorEnv(1, tracks=[circle], beams=0, observation="pose", reward=only(**{term: 1.0}), control_interval=5)
+        make_race_vector(
+            1, tracks=[circle], beams=0, observation="pose", reward=only(**{term: 1.0}), control_interval=5
+        )
         for term in ("progress", "lap_progress")
     )
     put(metres, [1.0, 0.2, 0.0, 3.0])
@@ -100,7 +103,7 @@ def test_progress_is_metres_and_lap_progress_laps_along_the_line(circle, put, fo
 
 
 def test_progress_backwards_is_negative(circle, put):
-    env = RaceVectorEnv(1, tracks=[circle], beams=0, reward=only(progress=1.0))
+    env = make_race_vector(1, tracks=[circle], beams=0, reward=only(progress=1.0))
     put(env, [0.3, 0.0, 0.0, -2.0])
     total = sum(env.step(np.array([[0.196, -0.76]]))[1][0] for _ in range(30))
     assert total == pytest.approx(-0.6, abs=0.05)
@@ -108,7 +111,7 @@ def test_progress_backwards_is_negative(circle, put):
 
 def test_milestones_count_once_and_not_again_after_reversing(circle, put):
     """Five a lap: one each 5.03 m from the start, wherever that is. Forward, back over it, forward again."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         1, tracks=[circle], beams=0, reward={**only(milestone=1.0), "milestones": 5}, termination={"stall_time": 0.0}
     )
     length = circle.centerline.length
@@ -127,7 +130,7 @@ def test_milestones_count_once_and_not_again_after_reversing(circle, put):
 
 def test_all_milestones_of_a_lap_are_counted(circle, put, follow):
     """Ten by default, with the wrap at the start line; each is worth the preset's 5."""
-    env = RaceVectorEnv(1, tracks=[circle], beams=0, reward="paper", control_interval=10)
+    env = make_race_vector(1, tracks=[circle], beams=0, reward="paper", control_interval=10)
     put(env, [13.0, 0.0, 0.0, 5.0])
     hits = []
     for _ in range(1000):
@@ -143,7 +146,7 @@ def test_all_milestones_of_a_lap_are_counted(circle, put, follow):
 @pytest.mark.parametrize("training_steps", [0, 50_000, 100_000, 10_000_000])
 def test_the_collision_penalty_grows_to_its_maximum(ellipse, put, training_steps):
     """-(1 + (c_max - 1) tanh(t / 1e5)), once, at the step of the crash."""
-    env = RaceVectorEnv(2, tracks=[ellipse], beams=0, reward={**only(collision=1.0), "collision_max": 4.0})
+    env = make_race_vector(2, tracks=[ellipse], beams=0, reward={**only(collision=1.0), "collision_max": 4.0})
     put(env, np.array([[[0.0, 0.0, 1.3, 5.0]], [[0.0, 0.0, 0.0, 0.0]]]))
     for _ in range(100):
         at(env, training_steps)
@@ -160,7 +163,7 @@ def test_the_collision_penalty_grows_to_its_maximum(ellipse, put, training_steps
 def test_a_stall_costs_one_where_it_ends_the_episode(ellipse, put):
     """And nothing before; a timeout is no stall."""
     for limits, expected in (({"stall_time": 0.05}, -1.0), ({"time_limit": 0.05}, 0.0)):
-        env = RaceVectorEnv(1, tracks=[ellipse], beams=0, reward=only(stall=1.0), termination=limits)
+        env = make_race_vector(1, tracks=[ellipse], beams=0, reward=only(stall=1.0), termination=limits)
         put(env, [0.0, 0.0, 0.0, 0.0])
         for step in range(10):
             _, rewards, _, truncated, _ = env.step(np.array([[0.0, STANDSTILL]]))
@@ -169,7 +172,7 @@ def test_a_stall_costs_one_where_it_ends_the_episode(ellipse, put):
 
 
 def test_training_steps_are_those_of_all_worlds(ellipse):
-    env = RaceVectorEnv(3, tracks=[ellipse], beams=0, control_interval=4)
+    env = make_race_vector(3, tracks=[ellipse], beams=0, control_interval=4)
     env.reset(seed=0)
     for step in range(1, 6):
         env.step(np.zeros((3, 2)))
@@ -181,7 +184,7 @@ def test_training_steps_are_those_of_all_worlds(ellipse):
 @pytest.mark.parametrize("training_steps", [0, 900_000, 1_000_000, 1_200_000, 10_000_000])
 def test_the_velocity_penalty_fades_over_training(big_circle, put, training_steps):
     """-(v - v_ref)² / (1 + exp((t - 1e6) / 1e5)) with v_ref = sqrt(mu g r) on the inside, the shortest way around."""
-    env = RaceVectorEnv(1, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0))
+    env = make_race_vector(1, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0))
     put(env, [2.0, 0.0, 0.0, 3.0])
     half_width = float(big_circle.centerline.width_left[0])
     reference = math.sqrt(1.0489 * 9.81 * (8.0 - half_width + 0.155 + DEFAULT_MARGIN))
@@ -195,7 +198,9 @@ def test_the_velocity_penalty_fades_over_training(big_circle, put, training_step
 
 def test_the_reference_speed_is_that_of_the_very_car(big_circle):
     """Friction is drawn for every world: on a circle the square of the speed is in proportion to it."""
-    env = RaceVectorEnv(6, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0), vehicle={"mu": (0.4, 0.9)})
+    env = make_race_vector(
+        6, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0), vehicle={"mu": (0.4, 0.9)}
+    )
     env.reset(seed=0)
     race = env.race
     assert race.reference is not None
@@ -208,7 +213,7 @@ def test_the_reference_speed_is_that_of_the_very_car(big_circle):
 def test_the_reference_is_that_of_the_place_and_of_the_track():
     """Two circuits in one environment: everywhere on either, the speed of the line's nearest point."""
     tracks = [generate_track(seed, length=60.0, name=f"track{seed}") for seed in (1, 2)]
-    env = RaceVectorEnv(8, tracks=tracks, beams=0, reward=only(velocity_matching=1.0), vehicle={"v_max": 8.0})
+    env = make_race_vector(8, tracks=tracks, beams=0, reward=only(velocity_matching=1.0), vehicle={"v_max": 8.0})
     env.reset(seed=1)
     race, seen = env.race, set()
     assert race.reference is not None
@@ -230,7 +235,7 @@ def test_the_reference_is_that_of_the_place_and_of_the_track():
 
 def test_the_reference_speed_is_no_more_than_the_car_can_drive(big_circle, put):
     """Cornering would allow 8.1 m/s; this car does 4, and one that drives 4 is not blamed."""
-    env = RaceVectorEnv(1, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0), vehicle={"v_max": 4.0})
+    env = make_race_vector(1, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0), vehicle={"v_max": 4.0})
     put(env, [2.0, 0.0, 0.0, 4.0])
     assert env.step(np.array([[0.1, 1.0]]))[1][0] == pytest.approx(0.0, abs=1e-4)
 
@@ -238,7 +243,7 @@ def test_the_reference_speed_is_no_more_than_the_car_can_drive(big_circle, put):
 def test_changes_of_the_action_cost_their_size(ellipse):
     """The first change counts from zero; only the ego's own actions count, after clipping."""
     steering, speed = (
-        RaceVectorEnv(1, tracks=[ellipse], num_cars=2, beams=0, reward=only(**{term: 1.0}))
+        make_race_vector(1, tracks=[ellipse], num_cars=2, beams=0, reward=only(**{term: 1.0}))
         for term in ("steering_change", "speed_change")
     )
     actions = [[0.3, -0.5], [0.3, -0.5], [-0.2, -0.1], [9.0, -0.1], [1.0, -0.6]]
@@ -251,7 +256,9 @@ def test_changes_of_the_action_cost_their_size(ellipse):
 
 
 def test_after_a_reset_the_change_counts_from_zero_again(ellipse):
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, reward=only(speed_change=1.0), termination={"time_limit": 0.02})
+    env = make_race_vector(
+        1, tracks=[ellipse], beams=0, reward=only(speed_change=1.0), termination={"time_limit": 0.02}
+    )
     env.reset(seed=0)
     costs = [env.step(np.array([[0.0, -0.4]]))[1][0] for _ in range(6)]
     np.testing.assert_allclose(costs, [-0.4, 0.0] * 3, atol=1e-6)
@@ -271,7 +278,7 @@ def test_the_papers_preset():
 
 
 def test_the_fast_preset_is_the_default(ellipse):
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0)
+    env = make_race_vector(1, tracks=[ellipse], beams=0)
     assert env.config.reward.preset == "fast"
     assert env.config.reward.resolved() == REWARD_PRESETS["fast"]
     assert {"progress", "collision", "steering_change"} <= set(REWARD_PRESETS["fast"])
@@ -279,7 +286,7 @@ def test_the_fast_preset_is_the_default(ellipse):
 
 def test_weights_replace_the_presets(ellipse):
     reward = {"preset": "paper", "weights": {"milestone": 0, "overtake": 7}}
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, reward=reward)
+    env = make_race_vector(1, tracks=[ellipse], beams=0, reward=reward)
     _, info = env.reset(seed=0)
     assert env.config.reward.resolved() == {
         "lap_progress": 100.0, "collision": 1.0, "velocity_matching": 10.0, "steering_change": 0.05, "overtake": 7.0,
@@ -309,6 +316,6 @@ def test_every_preset_names_terms_that_exist():
 )
 def test_wrong_rewards_are_refused(ellipse, reward, words):
     with pytest.raises(OutlapError, match=f"reward.*{words}|{words}") as caught:
-        RaceVectorEnv(1, tracks=[ellipse], beams=0, reward=reward)
+        make_race_vector(1, tracks=[ellipse], beams=0, reward=reward)
     assert "\n" not in str(caught.value)
     assert "reward" in str(caught.value)

@@ -13,9 +13,8 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from outlap.envs.race_env import RaceEnv
-from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
-from outlap.envs.sb3_vec_env import SB3VecEnv
+from outlap.envs.episodes import EPISODE_FIELDS
+from outlap.envs.keywords import make_race, make_race_vector, make_sb3
 from outlap.errors import OutlapError
 
 SHORT = {"time_limit": 0.2}  # 20 steps
@@ -31,14 +30,14 @@ def one_torch_thread():
 
 @pytest.mark.parametrize("scaled", [False, True])
 def test_sb3s_check_finds_nothing_in_the_single_environment(ellipse, scaled):
-    env = RaceEnv(tracks=[ellipse], beams=16, num_cars=2, scale_observations=scaled, lidar={"noise_std": 0.2})
+    env = make_race(tracks=[ellipse], beams=16, num_cars=2, scale_observations=scaled, lidar={"noise_std": 0.2})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env)
 
 
 def test_its_shapes_and_types_are_what_sb3_expects(ellipse):
-    env = SB3VecEnv(num_envs=3, tracks=[ellipse], num_cars=1, beams=7, control_interval=1)
+    env = make_sb3(num_envs=3, tracks=[ellipse], num_cars=1, beams=7, control_interval=1)
     assert isinstance(env, VecEnv)
     assert env.num_envs == 3
     observation = env.reset()
@@ -74,7 +73,7 @@ def test_it_is_the_vector_environment_with_the_same_seeds(ellipse, circle):
         "control_interval": 4,
         "start": {"speed": (0.0, 5.0)},
     }
-    ours, sb3 = RaceVectorEnv(4, **config), SB3VecEnv(4, **config)
+    ours, sb3 = make_race_vector(4, **config), make_sb3(4, **config)
     expected, _ = ours.reset(seed=7)
     sb3.seed(7)
     observation = sb3.reset()
@@ -113,7 +112,7 @@ def test_it_is_the_vector_environment_with_the_same_seeds(ellipse, circle):
 
 
 def test_seeds_hold_for_one_reset(ellipse):
-    env = SB3VecEnv(2, tracks=[ellipse], beams=0)
+    env = make_sb3(2, tracks=[ellipse], beams=0)
     env.seed(3)
     first, second = env.reset()["pose"], env.reset()["pose"]
     assert not np.array_equal(first, second)
@@ -123,7 +122,7 @@ def test_seeds_hold_for_one_reset(ellipse):
 
 
 def test_what_it_returns_is_not_a_live_buffer(ellipse):
-    env = SB3VecEnv(3, tracks=[ellipse], beams=5, termination=SHORT)
+    env = make_sb3(3, tracks=[ellipse], beams=5, termination=SHORT)
     env.seed(0)
     env.reset()
     returned = []
@@ -140,7 +139,7 @@ def test_what_it_returns_is_not_a_live_buffer(ellipse):
 
 
 def test_the_monitor_wrapper_agrees_with_our_own_episodes(ellipse):
-    env = VecMonitor(SB3VecEnv(3, tracks=[ellipse], beams=0, termination=SHORT), info_keywords=("outcome",))
+    env = VecMonitor(make_sb3(3, tracks=[ellipse], beams=0, termination=SHORT), info_keywords=("outcome",))
     env.seed(0)
     env.reset()
     episodes = 0
@@ -156,7 +155,7 @@ def test_the_monitor_wrapper_agrees_with_our_own_episodes(ellipse):
 
 
 def test_sb3s_own_normalisation_runs_on_it(ellipse):
-    env = VecNormalize(SB3VecEnv(2, tracks=[ellipse], beams=4, termination=SHORT), norm_obs_keys=["vel", "scan"])
+    env = VecNormalize(make_sb3(2, tracks=[ellipse], beams=4, termination=SHORT), norm_obs_keys=["vel", "scan"])
     env.reset()
     for _ in range(25):
         observation, _, _, _ = env.step(np.zeros((2, 2), np.float32))
@@ -185,7 +184,7 @@ class Watch(BaseCallback):
 
 def test_ppo_learns_on_it(ellipse):
     """A few updates: parameters change, episodes are logged, predictions are legal actions."""
-    env = SB3VecEnv(8, tracks=[ellipse], beams=12, scale_observations=True, termination={"time_limit": 0.3})
+    env = make_sb3(8, tracks=[ellipse], beams=12, scale_observations=True, termination={"time_limit": 0.3})
     model = PPO("MultiInputPolicy", env, n_steps=32, batch_size=64, n_epochs=2, seed=0, device="cpu")
     before = [parameter.clone() for parameter in model.policy.parameters()]
     watch = Watch()
@@ -202,7 +201,7 @@ def test_ppo_learns_on_it(ellipse):
 
 def test_a_replay_buffer_gets_the_final_observation_and_bootstraps_timeouts_only(ellipse):
     """What TD3 stores as the next state of an ended episode is not the next episode's first one."""
-    env = SB3VecEnv(2, tracks=[ellipse], beams=3, termination=SHORT, start={"speed": 4.0})
+    env = make_sb3(2, tracks=[ellipse], beams=3, termination=SHORT, start={"speed": 4.0})
     model = TD3(
         "MultiInputPolicy", env, learning_starts=10_000, buffer_size=400, seed=0, device="cpu",
         policy_kwargs={"net_arch": [8]},
@@ -225,7 +224,7 @@ def test_a_replay_buffer_gets_the_final_observation_and_bootstraps_timeouts_only
 
 @pytest.mark.parametrize("monitored", [False, True])
 def test_evaluate_policy_counts_the_episodes(ellipse, monitored):
-    env = SB3VecEnv(4, tracks=[ellipse], beams=6, termination=SHORT)
+    env = make_sb3(4, tracks=[ellipse], beams=6, termination=SHORT)
     model = PPO("MultiInputPolicy", env, n_steps=16, batch_size=64, seed=0, device="cpu")
     wrapped = VecMonitor(env) if monitored else env
     returns, lengths = evaluate_policy(model, wrapped, n_eval_episodes=10, return_episode_rewards=True, warn=False)
@@ -236,6 +235,6 @@ def test_evaluate_policy_counts_the_episodes(ellipse, monitored):
 
 def test_wrong_keywords_are_named(ellipse):
     with pytest.raises(OutlapError, match="beam is not a known field; did you mean beams"):
-        SB3VecEnv(num_envs=2, tracks=[ellipse], beam=5)
+        make_sb3(num_envs=2, tracks=[ellipse], beam=5)
     with pytest.raises(OutlapError, match="autoreset_mode"):
-        SB3VecEnv(num_envs=2, tracks=[ellipse], beams=0, autoreset_mode="Disabled")
+        make_sb3(num_envs=2, tracks=[ellipse], beams=0, autoreset_mode="Disabled")

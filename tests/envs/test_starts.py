@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 from outlap.track.centerline import Centerline
@@ -55,7 +56,7 @@ def starts(env: RaceVectorEnv, resets: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("cars", [1, 2, 3, 4])
 def test_no_start_touches_anything(ellipse, circle, cars):
     """Large cars of many sizes with wild headings: checked here with rectangles and the map's pixels."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         50, tracks=[ellipse, circle], num_cars=cars, beams=0, vehicle={"length": (0.4, 0.8), "width": (0.25, 0.45)},
         start={"offset": 1.0, "heading_error": 1.2, "gap": (0.0, 2.0)},
     )  # fmt: skip
@@ -74,7 +75,7 @@ def test_no_start_touches_anything(ellipse, circle, cars):
 
 
 def test_nobody_touches_anything_in_the_first_step(ellipse, circle):
-    env = RaceVectorEnv(100, tracks=[ellipse, circle], num_cars=4, beams=0, opponent_speed=0.0)
+    env = make_race_vector(100, tracks=[ellipse, circle], num_cars=4, beams=0, opponent_speed=0.0)
     env.reset(seed=1)
     terminated = env.step(np.tile([0.0, -0.6], (100, 1)))[2]
     assert not terminated.any()
@@ -82,14 +83,14 @@ def test_nobody_touches_anything_in_the_first_step(ellipse, circle):
 
 
 def test_anywhere_is_uniform_along_the_line(ellipse):
-    env = RaceVectorEnv(300, tracks=[ellipse], beams=0)
+    env = make_race_vector(300, tracks=[ellipse], beams=0)
     poses, _ = starts(env, 3)
     s, _ = ellipse.centerline.to_frenet(poses[..., 0].ravel(), poses[..., 1].ravel())
     assert stats.kstest(s, "uniform", args=(0.0, ellipse.centerline.length)).pvalue > 1e-5
 
 
 def test_otherwise_the_ego_stands_on_the_start_line(ellipse):
-    env = RaceVectorEnv(100, tracks=[ellipse], num_cars=3, beams=0, start={"anywhere": False})
+    env = make_race_vector(100, tracks=[ellipse], num_cars=3, beams=0, start={"anywhere": False})
     poses, _ = starts(env, 2)
     s, _ = ellipse.centerline.to_frenet(poses[..., 0, 0].ravel(), poses[..., 0, 1].ravel())
     np.testing.assert_allclose(np.minimum(s, ellipse.centerline.length - s), 0.0, atol=1e-3)
@@ -102,7 +103,7 @@ def test_otherwise_the_ego_stands_on_the_start_line(ellipse):
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_offset_and_heading_error_stay_within_the_configured_ones(ellipse, share):
     """offset: a share of the room that the car's half diagonal and a margin of 10 cm leave on either side."""
-    env = RaceVectorEnv(400, tracks=[ellipse], beams=0, start={"offset": share, "heading_error": 0.25})
+    env = make_race_vector(400, tracks=[ellipse], beams=0, start={"offset": share, "heading_error": 0.25})
     poses, _ = starts(env, 2)
     x, y, yaw = poses.reshape(-1, 3).T
     s, d = ellipse.centerline.to_frenet(x, y)
@@ -117,23 +118,23 @@ def test_offset_and_heading_error_stay_within_the_configured_ones(ellipse, share
 
 
 def test_speeds_are_drawn_per_car_and_start_straight(ellipse):
-    env = RaceVectorEnv(200, tracks=[ellipse], num_cars=2, beams=0, start={"speed": (1.0, 5.0)})
+    env = make_race_vector(200, tracks=[ellipse], num_cars=2, beams=0, start={"speed": (1.0, 5.0)})
     env.reset(seed=0)
     speed = env.race.worlds.state[..., 3]
     assert stats.kstest(speed.ravel(), "uniform", args=(1.0, 4.0)).pvalue > 1e-5
     assert abs(np.corrcoef(speed.T)[0, 1]) < 0.35
     np.testing.assert_array_equal(env.race.worlds.state[..., [2, 5, 6]], 0.0)
-    standing = RaceVectorEnv(5, tracks=[ellipse], beams=0)
+    standing = make_race_vector(5, tracks=[ellipse], beams=0)
     np.testing.assert_array_equal(standing.reset(seed=0)[0]["vel"], 0.0)
 
 
 def test_a_start_is_no_faster_than_the_car(ellipse):
-    env = RaceVectorEnv(5, tracks=[ellipse], beams=0, start={"speed": 9.0}, vehicle={"v_max": 4.0})
+    env = make_race_vector(5, tracks=[ellipse], beams=0, start={"speed": 9.0}, vehicle={"v_max": 4.0})
     np.testing.assert_allclose(env.reset(seed=0)[0]["vel"][:, 0], 4.0)
 
 
 def test_gaps_are_between_bumpers_and_every_order_occurs(big_circle):
-    env = RaceVectorEnv(200, tracks=[big_circle], num_cars=3, beams=0, start={"gap": (1.0, 2.0)})
+    env = make_race_vector(200, tracks=[big_circle], num_cars=3, beams=0, start={"gap": (1.0, 2.0)})
     orders, gaps = set(), []
     env.reset(seed=0)
     distance = env.race.worlds.distance
@@ -150,7 +151,7 @@ def test_a_track_too_narrow_for_the_car_is_said_to_be(circle):
     line = Centerline.from_points(4.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), 0.1, 0.1)
     alley = Track("alley", *_map(line), line)
     with pytest.raises(OutlapError, match=r"alley.*no start") as caught:
-        RaceVectorEnv(2, tracks=[alley], beams=0).reset(seed=0)
+        make_race_vector(2, tracks=[alley], beams=0).reset(seed=0)
     assert "\n" not in str(caught.value)
 
 
@@ -164,7 +165,7 @@ def test_a_place_too_narrow_for_the_car_is_avoided():
     angle = np.linspace(0.0, 2.0 * math.pi, 300, endpoint=False)
     width = np.where(angle < 2.0 * math.pi / 3.0, 0.1, 1.0)
     line = Centerline.from_points(6.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), width, width)
-    env = RaceVectorEnv(200, tracks=[Track("funnel", *_map(line), line)], beams=0)
+    env = make_race_vector(200, tracks=[Track("funnel", *_map(line), line)], beams=0)
     poses, _ = starts(env, 2)
     at = np.arctan2(poses[..., 1], poses[..., 0]) % (2.0 * math.pi)
     assert at.min() > 2.0 * math.pi / 3.0
@@ -176,7 +177,7 @@ def test_a_place_too_narrow_for_the_car_is_avoided():
 )
 def test_wrong_values_are_refused(ellipse, field, value):
     with pytest.raises(OutlapError, match=f"start.{field}"):
-        RaceVectorEnv(1, tracks=[ellipse], beams=0, start={field: value})
+        make_race_vector(1, tracks=[ellipse], beams=0, start={field: value})
 
 
 FORMATIONS = ("queue", "behind", "grid", "scattered")
@@ -189,7 +190,7 @@ FORMATIONS = ("queue", "behind", "grid", "scattered")
 )  # fmt: skip
 def test_no_formation_ever_starts_with_a_contact(big_circle, formation, cars, offset, heading_error, gap, spread, seed):
     """Rectangles against each other, whatever the formation: cars of many sizes, bumper to bumper if need be."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         10, tracks=[big_circle], num_cars=cars, beams=0, vehicle={"length": (0.4, 0.8), "width": (0.25, 0.4)},
         start={"formation": formation, "offset": offset, "heading_error": heading_error, "gap": (gap, gap + spread)},
     )  # fmt: skip
@@ -205,7 +206,7 @@ def test_no_formation_ever_starts_with_a_contact(big_circle, formation, cars, of
 
 
 def in_formation(track: Track, formation: str, cars: int, worlds: int = 200, **start) -> RaceVectorEnv:
-    env = RaceVectorEnv(
+    env = make_race_vector(
         worlds, tracks=[track], num_cars=cars, beams=0, start={"formation": formation, "heading_error": 0.0, **start}
     )
     env.reset(seed=0)

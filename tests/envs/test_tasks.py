@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from outlap.config import bounds
-from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.errors import OutlapError
 from outlap.seeding import world_keys
@@ -101,7 +101,7 @@ def test_draws_do_not_depend_on_the_company(ellipse, circle):
 
 def test_the_environment_draws_anew_in_every_episode(ellipse):
     """The vehicle in the info is the one that the simulator drives; fixed ranges stay fixed across resets."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         30, tracks=[ellipse], num_cars=2, beams=0, vehicle={"mu": {"min": 0.5, "max": 1.1}},
         termination={"time_limit": 0.02},
     )  # fmt: skip
@@ -125,7 +125,7 @@ def test_the_environment_draws_anew_in_every_episode(ellipse):
 
 def test_friction_reaches_the_tyres(big_circle, put):
     """Four fifths of the cornering speed on dry ground, on ice: the car with little grip runs wide."""
-    env = RaceVectorEnv(1, tracks=[big_circle], num_cars=1, beams=0, vehicle={"mu": (0.2, 1.0489)})
+    env = make_race_vector(1, tracks=[big_circle], num_cars=1, beams=0, vehicle={"mu": (0.2, 1.0489)})
     offsets = {}
     for mu in (0.2, 1.0489):
         env.reset(seed=0)
@@ -140,7 +140,7 @@ def test_friction_reaches_the_tyres(big_circle, put):
 
 def test_an_actuator_delay_is_drawn_and_holds_the_command_back(ellipse):
     """Full lock at once: the wheels move after each world's own delay."""
-    env = RaceVectorEnv(24, tracks=[ellipse], beams=0, actuators={"steer_delay": (0.0, 0.08)})
+    env = make_race_vector(24, tracks=[ellipse], beams=0, actuators={"steer_delay": (0.0, 0.08)})
     _, info = env.reset(seed=3)
     delay = to_records(info["vehicle"])["steer_delay"][:, 0]
     assert len(np.unique(delay)) == 24
@@ -155,7 +155,7 @@ def test_an_actuator_delay_is_drawn_and_holds_the_command_back(ellipse):
 
 def test_noise_and_mount_are_drawn_and_reach_the_scan(big_circle, put):
     """Standing still on a circle: a scan's standard deviation is its world's, its middle range the mount's."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         12, tracks=[big_circle], beams=541, observation="scan",
         lidar={"noise_std": (0.01, 0.2), "mount_x": (-0.2, 0.4), "dropout": 0.0}, vehicle={"mu": (0.5, 1.0)},
     )  # fmt: skip
@@ -180,7 +180,7 @@ def test_noise_is_drawn_anew_in_every_scan_car_episode_and_world(ellipse):
         "observation": "scan",
         "termination": {"time_limit": 0.03},
     }
-    true, noisy = RaceVectorEnv(3, **config), RaceVectorEnv(3, **config, lidar={"noise_std": 0.05})
+    true, noisy = make_race_vector(3, **config), make_race_vector(3, **config, lidar={"noise_std": 0.05})
     true.reset(seed=0)
     noisy.reset(seed=0)
     noise = []
@@ -218,7 +218,7 @@ def test_held_out_tracks_are_unreachable_from_training(ellipse, circle, big_circ
         numbers, _ = split.train.draw(keys, np.full(2000, episode), 1)
         drawn |= {split.train.tracks[number].name for number in numbers}
     assert drawn == {"ellipse", "ring4"}
-    env = RaceVectorEnv(50, tracks=split.train.tracks, beams=0, termination={"time_limit": 0.01})
+    env = make_race_vector(50, tracks=split.train.tracks, beams=0, termination={"time_limit": 0.01})
     _, info = env.reset(seed=0)
     seen = set(info["track"])
     for _ in range(20):
@@ -238,7 +238,7 @@ def test_the_built_in_sets_do_not_overlap_and_the_default_is_for_training(monkey
         return replace(ellipse, name=name)
 
     monkeypatch.setattr(catalog, "load_track", load)
-    env = RaceVectorEnv(1, beams=0)
+    env = make_race_vector(1, beams=0)
     assert tuple(asked_for) == BUILTIN_TRAIN
     assert env.config.tracks == BUILTIN_TRAIN
     assert [track.name for track in env.race.simulator.tracks] == list(BUILTIN_TRAIN)
@@ -246,7 +246,7 @@ def test_the_built_in_sets_do_not_overlap_and_the_default_is_for_training(monkey
 
 def test_augmented_tracks_are_driven_the_other_way_round_and_mirrored(ellipse, follow):
     """Four circuits of one: two turn left, two turn right, and the car laps them all."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         40, tracks=[ellipse], augment_tracks=True, beams=0, observation="curvature_ahead", control_interval=5,
         termination={"time_limit": 0.0}, start={"speed": 3.0},
     )  # fmt: skip
@@ -266,7 +266,7 @@ def test_augmented_tracks_are_driven_the_other_way_round_and_mirrored(ellipse, f
 def test_tracks_are_names_folders_or_tracks(ellipse, tmp_path):
     folder = write_track(ellipse, tmp_path / "ellipse")
     for given in (ellipse, [ellipse], (ellipse,), str(folder), [str(folder)], folder, [folder]):
-        env = RaceVectorEnv(1, tracks=given, beams=0)
+        env = make_race_vector(1, tracks=given, beams=0)
         _, info = env.reset(seed=0)
         assert info["track"] == ["ellipse"]
         assert env.config.tracks in (("ellipse",), (str(folder),))
@@ -276,4 +276,4 @@ def test_tracks_are_names_folders_or_tracks(ellipse, tmp_path):
 @pytest.mark.parametrize("tracks", [3, [3], None, [None], {"a": 1}, ["no such circuit anywhere"]])
 def test_what_is_not_a_track_is_refused(tracks):
     with pytest.raises(OutlapError, match="track"):
-        RaceVectorEnv(1, tracks=tracks, beams=0)
+        make_race_vector(1, tracks=tracks, beams=0)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 
@@ -26,7 +27,7 @@ def finish(env: RaceVectorEnv, action: Any, limit: int = 3000) -> tuple[str, boo
 
 
 def test_a_crash_into_the_wall_terminates(ellipse, put):
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0)
+    env = make_race_vector(1, tracks=[ellipse], beams=0)
     put(env, [0.0, 0.0, 1.4, 5.0])
     outcome, terminated, truncated, time = finish(env, [0.0, -0.2])
     assert (outcome, terminated, truncated) == ("crash", True, False)
@@ -35,7 +36,7 @@ def test_a_crash_into_the_wall_terminates(ellipse, put):
 
 
 def test_a_crash_into_a_car_terminates(ellipse, put):
-    env = RaceVectorEnv(1, tracks=[ellipse], num_cars=2, beams=0, opponent_speed=0.0)
+    env = make_race_vector(1, tracks=[ellipse], num_cars=2, beams=0, opponent_speed=0.0)
     put(env, np.array([[0.0, 0.0, 0.0, 5.0], [1.5, 0.0, 0.0, 0.0]]))
     outcome, terminated, truncated, time = finish(env, [0.0, -0.2])
     assert (outcome, terminated, truncated) == ("crash", True, False)
@@ -43,7 +44,9 @@ def test_a_crash_into_a_car_terminates(ellipse, put):
 
 
 def test_an_opponents_crash_ends_nothing(ellipse, put):
-    env = RaceVectorEnv(1, tracks=[ellipse], num_cars=2, beams=0, opponent_speed=3.0, termination={"stall_time": 0.0})
+    env = make_race_vector(
+        1, tracks=[ellipse], num_cars=2, beams=0, opponent_speed=3.0, termination={"stall_time": 0.0}
+    )
     put(env, np.array([[0.0, 0.0, 0.0, 0.0], [20.0, 0.0, 1.5, 3.0]]))
     for _ in range(100):
         _, _, terminated, truncated, info = env.step(np.array([[0.0, STANDSTILL]]))
@@ -53,7 +56,7 @@ def test_an_opponents_crash_ends_nothing(ellipse, put):
 
 
 def test_the_time_limit_truncates(ellipse, put, follow):
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, termination={"time_limit": 1.5})
+    env = make_race_vector(1, tracks=[ellipse], beams=0, termination={"time_limit": 1.5})
     put(env, [0.0, 0.0, 0.0, 2.0])
     assert finish(env, lambda env: follow(env, -0.5)) == ("timeout", False, True, pytest.approx(1.5))
 
@@ -61,7 +64,7 @@ def test_the_time_limit_truncates(ellipse, put, follow):
 @pytest.mark.parametrize("interval", [1, 4, 7])
 def test_the_time_limit_counts_physics_time(ellipse, put, follow, interval):
     """Not environment steps: the first decision at or after the limit is the last."""
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, control_interval=interval, termination={"time_limit": 0.6})
+    env = make_race_vector(1, tracks=[ellipse], beams=0, control_interval=interval, termination={"time_limit": 0.6})
     put(env, [0.0, 0.0, 0.0, 2.0])
     time = finish(env, lambda env: follow(env, -0.5))[-1]
     assert time == pytest.approx(-(-60 // interval) * interval * 0.01)
@@ -70,7 +73,7 @@ def test_the_time_limit_counts_physics_time(ellipse, put, follow, interval):
 @pytest.mark.parametrize("laps", [1, 2])
 def test_laps_done_truncate(circle, put, follow, laps):
     """From the line to the line; the stretch before the first crossing is the out-lap."""
-    env = RaceVectorEnv(1, tracks=[circle], beams=0, control_interval=2, termination={"laps": laps})
+    env = make_race_vector(1, tracks=[circle], beams=0, control_interval=2, termination={"laps": laps})
     length = circle.centerline.length
     put(env, [length - 2.0, 0.0, 0.0, 5.0])
     driven = [0.0]
@@ -92,7 +95,7 @@ def test_laps_done_truncate(circle, put, follow, laps):
 )
 def test_no_new_ground_is_a_stall(big_circle, put, speed, speed_action):
     """0.3 m of new ground are asked for within 3 s; creeping at 6 cm/s is not enough."""
-    env = RaceVectorEnv(1, tracks=[big_circle], beams=0)
+    env = make_race_vector(1, tracks=[big_circle], beams=0)
     put(env, [5.0, 0.0, 0.0, speed])
     steer = 0.098  # the circle's
     assert finish(env, [steer, speed_action]) == ("stalled", False, True, pytest.approx(3.0))
@@ -100,7 +103,7 @@ def test_no_new_ground_is_a_stall(big_circle, put, speed, speed_action):
 
 def test_driving_to_and_fro_is_a_stall(big_circle, put):
     """Ground that was reached before does not count."""
-    env = RaceVectorEnv(1, tracks=[big_circle], beams=0, termination={"stall_time": 4.0})
+    env = make_race_vector(1, tracks=[big_circle], beams=0, termination={"stall_time": 4.0})
     put(env, [5.0, 0.0, 0.0, 0.0])
     forwards, backwards = STANDSTILL + 0.08, STANDSTILL - 0.08
 
@@ -114,14 +117,14 @@ def test_driving_to_and_fro_is_a_stall(big_circle, put):
 
 
 def test_a_slow_car_that_gets_ahead_does_not_stall(big_circle, put):
-    env = RaceVectorEnv(1, tracks=[big_circle], beams=0, termination={"time_limit": 8.0})
+    env = make_race_vector(1, tracks=[big_circle], beams=0, termination={"time_limit": 8.0})
     put(env, [5.0, 0.0, 0.0, 0.2])
     assert finish(env, [0.098, STANDSTILL + 0.016])[0] == "timeout"  # 0.2 m/s: 0.3 m take 1.5 s
 
 
 def test_rules_can_be_switched_off(ellipse, put):
     limits = {"time_limit": 0, "stall_time": 0}
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, control_interval=50, termination=limits)
+    env = make_race_vector(1, tracks=[ellipse], beams=0, control_interval=50, termination=limits)
     put(env, [0.0, 0.0, 0.0, 0.0])
     for _ in range(200):
         _, _, terminated, truncated, info = env.step(np.array([[0.0, STANDSTILL]]))
@@ -131,17 +134,17 @@ def test_rules_can_be_switched_off(ellipse, put):
 
 def test_a_crash_at_the_time_limit_is_a_crash_and_never_both(ellipse, put):
     """Bootstrapping through a crash was the original's mistake."""
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0)
+    env = make_race_vector(1, tracks=[ellipse], beams=0)
     put(env, [0.0, 0.0, 1.4, 5.0])
     time = finish(env, [0.0, -0.2])[-1]
-    env = RaceVectorEnv(1, tracks=[ellipse], beams=0, termination={"time_limit": time})
+    env = make_race_vector(1, tracks=[ellipse], beams=0, termination={"time_limit": time})
     put(env, [0.0, 0.0, 1.4, 5.0])
     assert finish(env, [0.0, -0.2]) == ("crash", True, False, pytest.approx(time))
 
 
 def test_the_flags_are_never_both_set_and_tell_the_outcome(ellipse, circle):
     """Many worlds, random driving: crash ⇔ terminated, every other outcome ⇔ truncated, none ⇔ neither."""
-    env = RaceVectorEnv(
+    env = make_race_vector(
         16, tracks=[ellipse, circle], beams=0, control_interval=5, start={"speed": (0.0, 6.0)},
         termination={"time_limit": 1.2, "stall_time": 0.6, "stall_distance": 0.5},
     )  # fmt: skip
@@ -165,4 +168,4 @@ def test_the_flags_are_never_both_set_and_tell_the_outcome(ellipse, circle):
 )
 def test_wrong_values_are_refused(ellipse, field, value):
     with pytest.raises(OutlapError, match=f"termination.{field}"):
-        RaceVectorEnv(1, tracks=[ellipse], beams=0, termination={field: value})
+        make_race_vector(1, tracks=[ellipse], beams=0, termination={field: value})

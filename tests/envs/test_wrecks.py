@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from outlap.envs.keywords import make_race_vector
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, REMOVED
 
@@ -31,7 +32,7 @@ stands.observation_terms = ("frenet",)
 
 
 def race(track, driver, num_cars: int = 2, beams: int = 0, **config) -> RaceVectorEnv:
-    return RaceVectorEnv(
+    return make_race_vector(
         1, tracks=[track], num_cars=num_cars, beams=beams, opponents=[driver], opponent_speed=4.0,
         speed_range=(0.0, 8.0), termination=LIMITS, control_interval=2, **config,
     )  # fmt: skip
@@ -104,7 +105,7 @@ def test_a_removed_wreck_is_neither_seen_nor_touched_nor_passed(big_circle, put)
     observation, _, terminated, _, info = env.step(STANDSTILL)
     assert not terminated[0]
     np.testing.assert_array_equal(observation["nearby_cars"], 0.0)
-    alone = RaceVectorEnv(1, tracks=[big_circle], beams=31, observation="scan", speed_range=(0.0, 8.0))
+    alone = make_race_vector(1, tracks=[big_circle], beams=31, observation="scan", speed_range=(0.0, 8.0))
     alone.reset(seed=0)
     alone.race.worlds.state[0, 0] = env.race.worlds.state[0, 0]
     alone.race.worlds.state[0, 0, 3] = 0.0

@@ -65,10 +65,8 @@ def rows() -> pd.DataFrame:
 
 def race_alone(driver: Any, config: RaceConfig, track, seed: int) -> dict[str, Any]:
     """One episode in an environment of its own, with nothing of the evaluation's code."""
-    settings = {**dict(config), "tracks": [track]}
-    env = RaceEnv(
-        **{**settings, "observation": driver.observation_terms, "scale_observations": driver.scale_observations}
-    )
+    changes = {"observation": driver.observation_terms, "scale_observations": driver.scale_observations}
+    env = RaceEnv(config.model_copy(update=changes), [track])
     observation, info = env.reset(seed=seed)
     env._env.training_steps = CURRICULA_OVER
     while True:

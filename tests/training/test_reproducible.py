@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from outlap.drivers.policy import PolicyDriver
+from outlap.envs import RaceVectorEnv, SB3VecEnv
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.evaluation.rollout import evaluate
 from outlap.experiments.figures import read_learning
 from outlap.mql.adaptation import AdaptationSettings, adapt
@@ -132,7 +132,7 @@ def test_an_adaptation_and_an_evaluation_repeat_their_rows(threads):
         run = load_run("meta")
         meta = MQL.load(run.policy_path, device="cpu")
         meta.load_replay_buffer(run.replay_path)
-        task = SB3VecEnv(4, **dict(run.config.env))
+        task = SB3VecEnv(RaceVectorEnv(4, run.config.env))
         task.seed(5)
         settings = AdaptationSettings(iterations=1, collect_steps=20, on_task_steps=2, replay_steps=3)
         policy, record = adapt(meta, task, settings, seed=2)

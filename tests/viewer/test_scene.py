@@ -14,6 +14,7 @@ from imageio_ffmpeg import count_frames_and_secs
 
 import outlap  # noqa: F401
 from outlap.envs.frame import Cast, Frame
+from outlap.envs.keywords import make_race
 from outlap.envs.race_env import RaceEnv
 from outlap.errors import OutlapError
 from outlap.figure_style import BLUE, WALL_GREY
@@ -163,7 +164,7 @@ def test_the_board_ranks_cars_by_distance():
 
 
 def make(**settings) -> RaceEnv:
-    return RaceEnv(tracks=ring(), beams=40, render_mode="rgb_array", **settings)
+    return make_race(tracks=ring(), beams=40, render_mode="rgb_array", **settings)
 
 
 def test_rgb_array_is_a_picture_that_changes_as_the_car_moves():
@@ -200,4 +201,4 @@ def test_gymnasium_accepts_it_and_records_videos(tmp_path: Path, monkeypatch: py
 
 def test_another_render_mode_is_refused():
     with pytest.raises(OutlapError, match="render_mode is 'ansi'; must be None, human or rgb_array"):
-        RaceEnv(tracks=ring(), render_mode="ansi")
+        make_race(tracks=ring(), render_mode="ansi")

@@ -11,11 +11,12 @@ import pytest
 
 from outlap.drivers.find import find_drivers
 from outlap.envs.frame import Frame
+from outlap.envs.keywords import make_race
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.race_env import RaceEnv
 from outlap.errors import OutlapError
 from outlap.evaluation.rollout import standing_starts
 from outlap.simulator.collision import HIT_WALL
+from outlap.viewer.live import LiveView
 from outlap.viewer.scene import Entry, pygame
 from outlap.viewer.watch import REST, Watch
 from synthetic_tracks import ring
@@ -162,7 +163,7 @@ def test_it_ends_when_the_window_is_closed(watch: Watch):
 
 
 def test_render_mode_human_shows_every_step():
-    env = RaceEnv(tracks=TRACK, beams=0, observation=("vel",), render_mode="human")
+    env = make_race(tracks=TRACK, beams=0, observation=("vel",), render_mode="human")
     env.reset(seed=0)
     screen = pygame.display.get_surface()
     assert screen is not None
@@ -175,11 +176,11 @@ def test_render_mode_human_shows_every_step():
 
 
 def test_a_window_goes_on_with_the_next_track():
-    env = RaceEnv(tracks=[TRACK, ring(radius=5.0)], beams=0, observation=("vel",), render_mode="human")
+    env = make_race(tracks=[TRACK, ring(radius=5.0)], beams=0, observation=("vel",), render_mode="human")
     windows, tracks = set(), set()
     for seed in range(6):
         env.reset(seed=seed)
-        assert env._view is not None
+        assert isinstance(env._view, LiveView)
         window = env._view._window
         assert window is not None
         windows.add(id(window))
@@ -207,4 +208,4 @@ def test_without_a_screen_it_says_what_else_there_is(monkeypatch: pytest.MonkeyP
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(OutlapError, match=r"cannot open a window.*outlap video and outlap replay write files"):
-        RaceEnv(tracks=TRACK, render_mode="human").reset(seed=0)
+        make_race(tracks=TRACK, render_mode="human").reset(seed=0)

@@ -130,6 +130,7 @@ class Adapt:
         import pandas as pd
 
         from outlap.drivers.policy import PolicyDriver
+        from outlap.envs.race_vector_env import RaceVectorEnv
         from outlap.envs.sb3_vec_env import SB3VecEnv
         from outlap.envs.terminations import CRASH
         from outlap.evaluation.metrics import summarise_methods
@@ -171,7 +172,7 @@ class Adapt:
                 if not parts.has(number):
                     policy, updates = meta, None
                     if method != BEFORE:
-                        task = SB3VecEnv(self.collect_worlds, **{**dict(collecting), "tracks": [track]})
+                        task = SB3VecEnv(RaceVectorEnv(self.collect_worlds, collecting, [track]))
                         task.env.training_steps = meta.num_timesteps  # curricula go on where training ended
                         task.seed(10_000 + seed)
                         policy, record = adapt(meta, task, replace(base, clip=CLIP_RULES[method]()), seed=seed)

@@ -210,6 +210,7 @@ class BenchmarkMQL(LongCommand):
 
 def mql_with_replay(preset: str, beams: int, batch: int, device: str = "cpu") -> Any:
     """An MQL in worlds of its own, whose replay is filled."""
+    from outlap.envs.race_vector_env import RaceVectorEnv
     from outlap.envs.sb3_vec_env import SB3VecEnv
     from outlap.training.mql import MQLConfig
 
@@ -222,7 +223,7 @@ def mql_with_replay(preset: str, beams: int, batch: int, device: str = "cpu") ->
             "buffer_size": 1000 * MQL_WORLDS,
         }
     )  # fmt: skip
-    model: Any = config.make_model(SB3VecEnv(MQL_WORLDS, **dict(env)))
+    model: Any = config.make_model(SB3VecEnv(RaceVectorEnv(MQL_WORLDS, env)))
     model.learn((FILLED + 4) * MQL_WORLDS)
     return model
 
@@ -315,9 +316,9 @@ class BenchmarkRacing(LongCommand):
 def _measure_racing(settings: BenchmarkRacing) -> dict[str, Any]:
     import numpy as np
 
-    from outlap.envs.race_vector_env import RaceVectorEnv
+    from outlap.envs.keywords import make_race_vector
 
-    env = RaceVectorEnv(
+    env = make_race_vector(
         settings.worlds, tracks=settings.tracks, num_cars=settings.cars, beams=settings.beams,
         control_interval=settings.control_interval, opponents=settings.opponents, opponent_code=settings.opponent_code,
         scale_observations=True, observation=("scan", "vel", "heading", "previous_action"), speed_range=(0.0, 8.0),
@@ -336,7 +337,7 @@ def _measure_racing(settings: BenchmarkRacing) -> dict[str, Any]:
         "beams": settings.beams,
         "worlds": settings.worlds,
         "control_interval": settings.control_interval,
-        "opponents": env.opponent_names(),
+        "opponents": [driver.name for driver in env.opponents.drivers],
         "ego_steps_per_second": round(float(np.median(rates[1:]))),
         "slowest_ego_steps_per_second": round(min(rates[1:])),
         "fastest_ego_steps_per_second": round(max(rates[1:])),

@@ -295,7 +295,7 @@ def compare(
     env = run.config.env
     own = run.driver()
     shown = {"observation": own.observation_terms, "scale_observations": False, "augment_tracks": False}
-    race = RaceVectorEnv(1, **{**dict(env), **shown})
+    race = RaceVectorEnv(1, env.model_copy(update=shown))
     observation, _ = race.reset(seed=seed)
     begins = np.ones(1, bool)
     of_action = of_command = 0.0

@@ -1,3 +1,7 @@
+from .keywords import make_parallel as make_parallel
+from .keywords import make_race as make_race
+from .keywords import make_race_vector as make_race_vector
+from .keywords import make_sb3 as make_sb3
 from .race_config import RaceConfig as RaceConfig
 from .race_env import RaceEnv as RaceEnv
 from .race_vector_env import RaceVectorEnv as RaceVectorEnv

@@ -70,7 +70,7 @@ class Frame:
 def cast_of(env: RaceVectorEnv, driver: str) -> Cast:
     """Who races in the first world, with the name of the ego's driver; rivals of one name are numbered."""
     params = env.race.worlds.params[0]
-    rivals = env.rivals(0)
+    rivals = [name or f"car {car}" for car, name in enumerate(env.opponents.names()[0].tolist(), 1)]
     numbered = [
         name if rivals.count(name) == 1 else f"{name} {rivals[: i + 1].count(name)}" for i, name in enumerate(rivals)
     ]

@@ -17,6 +17,7 @@ import numpy as np
 
 from outlap.envs.race import Race
 from outlap.envs.racing_line import LINE_SPEED, LINE_X, LINE_Y
+from outlap.errors import OutlapError
 from outlap.simulator import state as column
 from outlap.simulator.collision import REMOVED
 from outlap.simulator.kernels import HEADING_ERROR, OFFSET
@@ -149,6 +150,13 @@ OBSERVATION_TERMS: dict[str, ObservationTerm] = {
     ),
     "action_span": ObservationTerm(action_span, low=(-INF,), high=(INF,), scale=(0.4, 10.0, 10.0), size=3),
 }
+
+
+def check_terms(terms: Sequence[str], driver: str) -> None:
+    """Raise OutlapError that names a driver which observes a term that does not exist."""
+    for name in terms:
+        if name not in OBSERVATION_TERMS:
+            raise OutlapError(f"driver {driver}: observes {name!r}; must be one of {', '.join(OBSERVATION_TERMS)}")
 
 
 def observation_space(

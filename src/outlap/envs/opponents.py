@@ -9,7 +9,7 @@ import numpy as np
 from outlap.config import Number, bounds
 from outlap.drivers.driver import Driver, DriverStack
 from outlap.envs.actions import driver_actions
-from outlap.envs.observations import OBSERVATION_TERMS, observe
+from outlap.envs.observations import check_terms, observe
 from outlap.envs.race import Race
 from outlap.errors import OutlapError
 from outlap.seeding import DRIVER_STREAM, NOISE_STREAM, uniform
@@ -54,11 +54,7 @@ class Opponents:
                     f"driver {driver.name}: looks with {driver.beams} beams, and the cars have "
                     f"{race.worlds.scan.shape[2]}; set beams to {driver.beams} or more"
                 )
-            unknown = [term for term in driver.observation_terms if term not in OBSERVATION_TERMS]
-            if unknown:
-                raise OutlapError(
-                    f"driver {driver.name}: observes {unknown[0]!r}; must be one of {', '.join(OBSERVATION_TERMS)}"
-                )
+            check_terms(driver.observation_terms, driver.name)
 
     def names(self) -> np.ndarray:
         """Of the drivers at work: object (worlds, cars - 1)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -10,9 +11,13 @@ from gymnasium.vector import AutoresetMode
 from pettingzoo import ParallelEnv
 
 from outlap.envs.actions import check_actions
-from outlap.envs.race_vector_env import CONTACTS, RaceVectorEnv
-from outlap.envs.terminations import CRASH, RUNNING
+from outlap.envs.episodes import CONTACTS
+from outlap.envs.race import RUNNING
+from outlap.envs.race_config import RaceConfig
+from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
+from outlap.track.track import Track
 
 
 class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
@@ -25,24 +30,21 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
 
     metadata: ClassVar[dict[str, Any]] = {"name": "outlap_race_v0", "render_modes": []}
 
-    def __init__(self, num_cars: int = 2, **config: Any) -> None:
-        """Build a race.
+    def __init__(self, config: RaceConfig, tracks: Sequence[Track] | None = None) -> None:
+        """Build a race. `envs.keywords.make_parallel` builds it from keywords.
 
         Args:
-            num_cars: agents.
-            **config: tracks and the fields of `RaceConfig`, without those of opponents.
+            config: the race of `num_cars` agents; its opponents are not used.
+            tracks: to race on instead of those that `config.tracks` names.
 
-        Raises OutlapError as `RaceVectorEnv` does, and for fields that a race without opponents has no use for.
+        Raises OutlapError as `RaceVectorEnv` does, and for wrecks that respawn.
         """
-        for name in ("num_envs", "autoreset_mode", "opponents", "opponent_speed", "opponent_noise"):
-            if name in config:
-                raise OutlapError(f"{name}: a race whose cars are all agents has none; leave it out")
-        self._env = RaceVectorEnv(1, num_cars=num_cars, opponents=(), autoreset_mode=AutoresetMode.DISABLED, **config)
-        self.config = self._env.config
-        if self.config.opponent_crash == "respawn":
+        if config.opponent_crash == "respawn":
             raise OutlapError("opponent_crash is 'respawn'; must be park or remove: an agent that crashed is out")
+        self._env = RaceVectorEnv(1, config, tracks, (), autoreset_mode=AutoresetMode.DISABLED)
+        self.config = config
         self.render_mode = None
-        self.possible_agents = [f"car_{i}" for i in range(num_cars)]
+        self.possible_agents = [f"car_{i}" for i in range(config.num_cars)]
         self.agents: list[str] = []
         self._cars = {agent: car for car, agent in enumerate(self.possible_agents)}
 
@@ -60,7 +62,7 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         """Begin a race; a seed starts the stream of races anew."""
         self._env.reset(seed=seed)
         self.agents = list(self.possible_agents)
-        return self._observe(), {agent: self._info(agent, RUNNING) for agent in self.agents}
+        return self._observe(), {agent: self._info(agent) for agent in self.agents}
 
     def step(
         self, actions: dict[str, np.ndarray]
@@ -77,10 +79,10 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         """
         env, racing = self._env, self.agents
         env.advance(self._all_actions(actions))
-        outcomes = {agent: str(env.outcomes(self._cars[agent])[0]) for agent in racing}
-        rewards = {agent: float(env.rewards(self._cars[agent])[0]) for agent in racing}
+        outcomes = {agent: str(env.race.outcome[0, self._cars[agent]]) for agent in racing}
+        rewards = {agent: float(env.race.rewards[0, self._cars[agent]]) for agent in racing}
         observations = self._observe()
-        infos = {agent: self._info(agent, outcomes[agent]) for agent in racing}
+        infos = {agent: self._info(agent) for agent in racing}
         crashed = {agent: outcome == CRASH for agent, outcome in outcomes.items()}
         stopped = {agent: outcome not in (RUNNING, CRASH) for agent, outcome in outcomes.items()}
         gone = np.zeros((1, self.config.num_cars), bool)
@@ -104,11 +106,11 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             for agent in self.agents
         }
 
-    def _info(self, agent: str, outcome: str) -> dict[str, Any]:
+    def _info(self, agent: str) -> dict[str, Any]:
         """Of a car: how its race ended, what it hit, laps and places so far."""
         race, car = self._env.race, self._cars[agent]
         return {
-            "outcome": outcome,
+            "outcome": str(race.outcome[0, car]),
             "contact": CONTACTS[race.worlds.contact[0, car]],
             "impact_speed_mps": float(race.worlds.impact_speed[0, car]),
             "progress_m": float(race.distance[0, car] - race.start[0, car]),

@@ -17,6 +17,7 @@ from outlap.simulator.kernels import ARC_LENGTH
 from outlap.simulator.simulator import Simulator
 
 EGO = 0
+RUNNING = ""  # the outcome of a race that goes on
 
 
 @dataclass
@@ -37,7 +38,7 @@ class Race:
     farthest_before: np.ndarray = field(init=False)  # one step ago [m]
     farthest_time: np.ndarray = field(init=False)  # when that last grew by the stall distance [s]
     stall_mark: np.ndarray = field(init=False)  # distance at that time [m]
-    stalled: np.ndarray = field(init=False)  # bool: this step ended the car's race for want of progress
+    outcome: np.ndarray = field(init=False)  # str: how this step ended the car's race, see `terminations`
     ahead: np.ndarray = field(init=False)  # bool (worlds, cars, cars): whether the first car is ahead of the second
     racing: np.ndarray = field(init=False)  # bool: on the track
     places_gained: np.ndarray = field(init=False)  # in this step
@@ -55,7 +56,7 @@ class Race:
         self.farthest_before = np.zeros(everyone)
         self.farthest_time = np.zeros(everyone)
         self.stall_mark = np.zeros(everyone)
-        self.stalled = np.zeros(everyone, bool)
+        self.outcome = np.full(everyone, RUNNING, "U8")
         self.ahead = np.zeros((*everyone, everyone[1]), bool)
         self.racing = np.ones(everyone, bool)
         self.places_gained = np.zeros(everyone, np.int64)
@@ -114,6 +115,7 @@ class Race:
         self.racing[which] = True
         self.places_gained[which] = 0
         self.places_lost[which] = 0
+        self.outcome[which] = RUNNING
         self.rewards[which] = 0.0
 
     def act(self, actions: np.ndarray) -> None:

@@ -7,10 +7,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, field_validator
 
 from outlap.config import Number, bounded, bounds
+from outlap.envs.observations import OBSERVATION_TERMS
 from outlap.envs.racing_line import RacingLine
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.starts import StartConfig
 from outlap.envs.terminations import TerminationConfig
+from outlap.envs.wrecks import CrashRule
 from outlap.simulator.simulator import SimulatorConfig
 from outlap.simulator.vehicle import PRESETS, ActuatorParams, LidarParams, VehicleParams
 
@@ -39,7 +41,7 @@ class RaceConfig(SimulatorConfig):
     opponents: tuple[str, ...] = ("pure-pursuit",)  # see drivers.find; one driver is drawn per opponent and reset
     opponent_split: Literal["train", "held_out"] = "train"  # the half of a population; training takes no other
     opponent_code: bool = False  # whether modules may be imported for opponents, module:function
-    opponent_crash: Literal["park", "remove", "respawn"] = "park"  # what becomes of an opponent that crashed
+    opponent_crash: CrashRule = "park"  # what becomes of an opponent that crashed
     opponent_speed: Annotated[Number, bounded(at_least=0)] | None = None  # their cars' top speed [m/s], drawn likewise
     opponent_noise: Annotated[Number, bounded(at_least=0)] = 0.0  # standard deviation of their actions, likewise
     control_interval: int = Field(default=1, ge=1, le=100)  # physics steps per action
@@ -63,8 +65,6 @@ class RaceConfig(SimulatorConfig):
     @field_validator("observation")
     @classmethod
     def _known_terms(cls, terms: tuple[str, ...]) -> tuple[str, ...]:
-        from outlap.envs.observations import OBSERVATION_TERMS
-
         for name in terms:
             if name not in OBSERVATION_TERMS:
                 raise ValueError(f"{name!r} is not an observation term; there are {', '.join(OBSERVATION_TERMS)}")

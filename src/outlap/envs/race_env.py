@@ -2,52 +2,79 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from outlap.drivers.driver import Driver
 from outlap.envs.actions import check_actions
+from outlap.envs.race_config import RaceConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
-
-if TYPE_CHECKING:
-    from outlap.viewer.live import LiveView
+from outlap.plugins import load
+from outlap.track.track import Track
 
 RENDER_MODES = ("human", "rgb_array")
 
 
+class Renderer(Protocol):
+    """Draws the first world of an environment; looked up as the entry point `live` of `outlap.renderers`."""
+
+    def see(self, begins: bool) -> None:
+        """Take note of a step, or of the beginning of an episode; show it if there is a window."""
+        ...
+
+    def pixels(self) -> np.ndarray | None:
+        """Return the picture: uint8 (height, width, 3); None for a window, and before the first episode."""
+        ...
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        ...
+
+
+class RendererFactory(Protocol):
+    """What the entry point holds."""
+
+    def __call__(self, env: RaceVectorEnv, window: bool) -> Renderer: ...
+
+
 class RaceEnv(gym.Env):
-    """One race. Spaces, keywords and `info` are those of a world of `RaceVectorEnv`.
+    """One race. Spaces and `info` are those of a world of `RaceVectorEnv`.
 
     `lap_time_s` and `last_lap_time_s` come into `info` with the first completed lap.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012  # as Gymnasium has it
 
-    def __init__(self, *, render_mode: str | None = None, **config: Any) -> None:
-        """Build a race.
+    def __init__(
+        self,
+        config: RaceConfig,
+        tracks: Sequence[Track] | None = None,
+        opponents: Sequence[Driver] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Build a race. `envs.keywords.make_race` builds it from keywords.
 
         Args:
+            config, tracks, opponents: see `RaceVectorEnv`.
             render_mode: "human" shows every step in a window, at the speed of the race; "rgb_array" makes `render`
                 draw. Both need the extra `viewer`.
-            **config: keywords of `RaceVectorEnv`.
 
         Raises OutlapError as `RaceVectorEnv` does, and for another render mode.
         """
         if render_mode not in (None, *RENDER_MODES):
             raise OutlapError(f"render_mode is {render_mode!r}; must be None, {' or '.join(RENDER_MODES)}")
-        for name in ("num_envs", "autoreset_mode"):
-            if name in config:
-                raise OutlapError(f"{name}: a single race has none; take gymnasium.make_vec or RaceVectorEnv")
-        self._env = RaceVectorEnv(1, autoreset_mode=AutoresetMode.DISABLED, **config)
-        self.config = self._env.config
+        self._env = RaceVectorEnv(1, config, tracks, opponents, autoreset_mode=AutoresetMode.DISABLED)
+        self.config = config
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space
         self.metadata = {**self.metadata, "render_fps": self._env.metadata["render_fps"]}
         self.render_mode = render_mode
-        self._view: LiveView | None = None
+        self._view: Renderer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -79,9 +106,8 @@ class RaceEnv(gym.Env):
         if self.render_mode is None:
             return
         if self._view is None:
-            from outlap.viewer.live import LiveView  # pygame: not before it is needed
-
-            self._view = LiveView(self._env, window=self.render_mode == "human")
+            renderer: RendererFactory = load("outlap.renderers", "live")
+            self._view = renderer(self._env, window=self.render_mode == "human")
         self._view.see(begins)
 
 

@@ -5,7 +5,7 @@ A term is unweighted: (worlds,) float of one car. The reward is the sum of weigh
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +13,9 @@ from pydantic import Field, field_validator, model_validator
 
 from outlap.config import Config
 from outlap.envs.race import Race
+from outlap.envs.terminations import STALLED
+
+CURRICULA_OVER = 10**12  # training steps at which every curriculum is at its end
 
 
 class RewardConfig(Config):
@@ -41,6 +44,10 @@ class RewardConfig(Config):
             if name not in REWARD_TERMS:
                 raise ValueError(f"{name!r} is not a reward term; there are {', '.join(REWARD_TERMS)}")
         return weights
+
+    def without_curricula(self) -> RewardConfig:
+        """The reward after `CURRICULA_OVER` steps, without the term that is zero then: it needs planned lines."""
+        return self.model_copy(update={"weights": {**self.weights, "velocity_matching": 0.0}})
 
     def resolved(self) -> dict[str, float]:
         """The weight of every term that counts."""
@@ -73,7 +80,7 @@ def collision(race: Race, car: int, config: RewardConfig) -> np.ndarray:
 
 def stall(race: Race, car: int, config: RewardConfig) -> np.ndarray:
     """-1 where the episode ends because the car gets no further: else a careful policy would rather stand."""
-    return -race.stalled[:, car].astype(np.float64)
+    return -(race.outcome[:, car] == STALLED).astype(np.float64)
 
 
 def velocity_matching(race: Race, car: int, config: RewardConfig) -> np.ndarray:
@@ -117,6 +124,19 @@ REWARD_TERMS: dict[str, Callable[[Race, int, RewardConfig], np.ndarray]] = {
     "overtake": overtake,
     "overtaken": overtaken,
 }
+
+
+def weighted_terms(race: Race, car: int, config: RewardConfig, weights: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Return weight × term for the last step of a car, (worlds,) each; their sum is its reward.
+
+    Args:
+        race: after the step, with its outcomes.
+        car: the car's number.
+        config: constants of the terms.
+        weights: by term, of `config.resolved()`.
+    """
+    return {name: weight * REWARD_TERMS[name](race, car, config) for name, weight in weights.items()}
+
 
 REWARD_PRESETS: dict[str, dict[str, float]] = {
     # Learns within minutes: progress, and a smooth hand.

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from outlap.envs.race_vector_env import EPISODE_FIELDS, RaceVectorEnv
+from outlap.envs.episodes import EPISODE_FIELDS, REWARD_PREFIX
+from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
 
 # Of every world at every step; the rest of the information is given when an episode ends.
@@ -16,19 +18,20 @@ EVERY_STEP = ("track", "task")
 
 
 class SB3VecEnv(VecEnv):
-    """`num_envs` worlds of `RaceVectorEnv` for Stable-Baselines3.
+    """The worlds of a `RaceVectorEnv` for Stable-Baselines3.
 
     The `infos` of a world whose episode just ended hold its `outcome`, every reward term, `terminal_observation`,
     `TimeLimit.truncated`, and `episode`: `r`, `l`, `t`, `outcome`, all of `EPISODE_FIELDS`, every reward term.
     """
 
-    def __init__(self, num_envs: int = 1, **config: Any) -> None:
-        if "autoreset_mode" in config:
-            raise OutlapError("autoreset_mode: Stable-Baselines3 knows only SAME_STEP; leave it out")
-        self.env = RaceVectorEnv(num_envs, **config)
+    def __init__(self, env: RaceVectorEnv) -> None:
+        """Wrap an environment, whose autoreset mode must be SAME_STEP."""
+        if env.autoreset_mode != AutoresetMode.SAME_STEP:
+            raise OutlapError(f"autoreset_mode is {env.autoreset_mode}; Stable-Baselines3 knows only SAME_STEP")
+        self.env = env
         self.render_mode = None
-        self._actions = np.zeros((num_envs, 2), np.float32)
-        super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
+        self._actions = np.zeros((env.num_envs, 2), np.float32)
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> dict[str, np.ndarray]:
         """Begin an episode in every world, with the seeds that `seed` set."""
@@ -58,7 +61,7 @@ class SB3VecEnv(VecEnv):
                     "l": int(final["episode_steps"]),
                     "t": float(final["time_s"]),
                     "outcome": str(final["outcome"]),
-                    **{name: float(value) for name, value in final.items() if _is_told_of_episodes(name)},
+                    **{name: float(value) for name, value in final.items() if _is_statistic(name)},
                 },
                 "terminal_observation": info["final_obs"][world],
                 "TimeLimit.truncated": bool(truncated[world]),
@@ -95,5 +98,5 @@ class SB3VecEnv(VecEnv):
         return {name: info[name][world] for name in EVERY_STEP}
 
 
-def _is_told_of_episodes(name: str) -> bool:
-    return name in EPISODE_FIELDS or name.startswith("reward_")
+def _is_statistic(name: str) -> bool:
+    return name in EPISODE_FIELDS or name.startswith(REWARD_PREFIX)

@@ -9,10 +9,14 @@ from pydantic import Field
 
 from outlap.config import Config, Number, bounded, bounds
 from outlap.envs.race import EGO
+from outlap.errors import OutlapError
 from outlap.seeding import START_STREAM, uniform
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
+from outlap.simulator.collision import FREE
+from outlap.simulator.simulator import Simulator
 from outlap.track.centerline import WIDTH_LEFT, WIDTH_RIGHT
 
+START_ATTEMPTS = 20
 MARGIN = 0.1  # [m] that a start leaves at least between the car and the track's edge, or the next car
 GAP, ORDER, SIDE, HEADING, SPEED = range(5)  # what is drawn for each car
 
@@ -30,6 +34,45 @@ class StartConfig(Config):
     offset: float = Field(default=0.5, ge=0, le=1)  # largest, as a share of the room to the track's edge; a grid's own
     heading_error: float = Field(default=0.1, ge=0)  # largest [rad]
     gap: Annotated[Number, bounded(at_least=0)] = (1.5, 4.0)  # along the track [m]; between scattered cars the smaller
+
+
+def reset_worlds(
+    config: StartConfig,
+    simulator: Simulator,
+    which: np.ndarray,
+    keys: np.ndarray,
+    episodes: np.ndarray,
+    tracks: np.ndarray,
+    params: np.ndarray,
+) -> None:
+    """Reset some worlds to starts at which no car touches anything; redraw those of a world until there is none.
+
+    Args:
+        config: the formation.
+        simulator: whose worlds to reset.
+        which: (n,) numbers of the worlds.
+        keys: uint64 (n,) of the worlds.
+        episodes: (n,) number of each world's episode.
+        tracks: (n,) numbers in the atlas.
+        params: of the cars, (n, cars).
+
+    Raises OutlapError for a track on which no such start is found.
+    """
+    noise_keys = keys ^ (episodes.astype(np.uint64) << np.uint64(32))
+    waiting = np.arange(len(which))
+    for attempt in range(START_ATTEMPTS):
+        # The later the attempt, the nearer to the centreline: a narrow place ends the loop all the same.
+        spread = 1.0 - attempt / (START_ATTEMPTS - 1)
+        draws = episodes[waiting] * START_ATTEMPTS + attempt
+        starts = draw_starts(config, simulator.atlas, keys[waiting], draws, tracks[waiting], params[waiting], spread)
+        simulator.reset(
+            which[waiting], keys=noise_keys[waiting], tracks=tracks[waiting], params=params[waiting], starts=starts
+        )
+        waiting = waiting[(simulator.worlds.contact[which[waiting]] != FREE).any(axis=1)]
+        if not len(waiting):
+            return
+    name = simulator.tracks[tracks[waiting[0]]].name
+    raise OutlapError(f"track {name}: found no start free of contact; is it as wide as a car, and long enough for all?")
 
 
 def draw_starts(

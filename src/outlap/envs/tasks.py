@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -80,10 +79,3 @@ class TaskSplit:
 def _circuit(track: Track) -> str:
     """The name of the circuit, whichever way it is driven or seen."""
     return track.name.removesuffix(" mirrored").removesuffix(" reversed")
-
-
-def track_name(track: str | os.PathLike[str] | Track) -> str:
-    """What a configuration calls a track: its name, or the path that was given."""
-    if not isinstance(track, (str, os.PathLike, Track)):
-        raise OutlapError(f"tracks: {track!r:.60} is not a track; give a name, a map folder or a Track")
-    return track.name if isinstance(track, Track) else os.fspath(track)

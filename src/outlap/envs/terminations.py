@@ -6,9 +6,9 @@ import numpy as np
 from pydantic import Field
 
 from outlap.config import Config
-from outlap.envs.race import Race
+from outlap.envs.race import RUNNING, Race
 
-RUNNING, CRASH, FINISHED, TIMEOUT, STALLED = "", "crash", "finished", "timeout", "stalled"
+CRASH, FINISHED, TIMEOUT, STALLED = "crash", "finished", "timeout", "stalled"
 
 
 class TerminationConfig(Config):

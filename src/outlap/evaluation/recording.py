@@ -21,9 +21,10 @@ from outlap.envs.frame import MOTION, Cast, Frame, Words, X, Y, between, cast_of
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.envs.rewards import CURRICULA_OVER
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError, brief
-from outlap.evaluation.rollout import CURRICULA_OVER, episode_settings, single_race, standing_starts
+from outlap.evaluation.rollout import episode_task, single_race, standing_starts
 from outlap.files import atomic_write
 from outlap.simulator import state as column
 from outlap.track.track import Track
@@ -279,7 +280,8 @@ def record_lap(driver: Driver, env: RaceConfig, track: Track, seed: int = 0) -> 
     Raises OutlapError where the driver does not complete it.
     """
     alone = standing_starts(env.model_copy(update={"num_cars": 1}), [track], laps=1)
-    race = RaceVectorEnv(1, **episode_settings(driver, alone, track), autoreset_mode=AutoresetMode.DISABLED)
+    task, _ = episode_task(driver, alone)
+    race = RaceVectorEnv(1, task, [track], autoreset_mode=AutoresetMode.DISABLED)
     observation, info = race.reset(seed=seed)
     driver.begin(np.ones(1, bool))
     worlds, lap = race.race.worlds, []

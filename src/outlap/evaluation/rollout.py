@@ -20,10 +20,11 @@ from gymnasium.vector import AutoresetMode
 from outlap.drivers.driver import Driver
 from outlap.drivers.find import find_drivers
 from outlap.envs.actions import driver_actions
+from outlap.envs.observations import check_terms
 from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
-from outlap.envs.rewards import REWARD_TERMS, RewardConfig
+from outlap.envs.rewards import CURRICULA_OVER, RewardConfig, weighted_terms
 from outlap.envs.terminations import CRASH, TerminationConfig
 from outlap.errors import OutlapError
 from outlap.planning.limits import Limits
@@ -36,7 +37,6 @@ log = logging.getLogger(__name__)
 
 DEFAULT_WORLDS = 128
 CRAWL = 1.0  # [m/s] mean speed at which the default time limit still allows all laps and the way to the line
-CURRICULA_OVER = 10**12  # training steps: returns are those at the end of every reward curriculum
 VEHICLE = "vehicle"  # in a row while its episode is raced: the ego's parameters
 IDLE = -1  # the episode of a world that has none left
 
@@ -183,12 +183,12 @@ def _race(
 ) -> tuple[list[dict[str, Any]], int]:
     """Every episode of one track: its rows, and the steps that they took."""
     worlds = min(num_worlds, len(seeds))
-    settings = episode_settings(driver, config, track)
-    env = RaceVectorEnv(worlds, **settings, autoreset_mode=AutoresetMode.DISABLED)
-    score = _Score(config.reward, settings["reward"], worlds)
+    task, opponents = episode_task(driver, config)
+    env = RaceVectorEnv(worlds, task, [track], opponents, autoreset_mode=AutoresetMode.DISABLED)
+    score = _Score(config.reward, task.reward, worlds)
     driver.check(env.single_observation_space)
     drawn = drawn_parameters(config)
-    opponents = range(1, config.num_cars if isinstance(config.opponent_speed, tuple) else 1)
+    drawn_speeds = range(1, config.num_cars if isinstance(config.opponent_speed, tuple) else 1)
     length = track.centerline.length
     rows: dict[int, dict[str, Any]] = {}
     racing = np.arange(worlds)  # the episode of each world
@@ -218,7 +218,7 @@ def _race(
                 "start_m": float(start[world] % length),
                 **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
                 **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in range(1, config.num_cars)},
-                **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in opponents},
+                **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in drawn_speeds},
                 VEHICLE: info["vehicle"][world, EGO].copy(),
             }
         if over.any():
@@ -256,24 +256,26 @@ def _with_lap_time_ratios(
     return rows
 
 
-def episode_settings(driver: Driver, config: RaceConfig, track: Track) -> dict[str, Any]:
-    """Keywords of the environment that this driver needs."""
-    settings = dict(config)
-    settings["tracks"] = [track]
-    settings["augment_tracks"] = False  # the track that was named, not one of its variants
-    settings["observation"] = driver.observation_terms
-    settings["scale_observations"] = driver.scale_observations
-    # At the end of every curriculum nothing is left of it: no lines need to be planned for a reference speed.
+def episode_task(driver: Driver, config: RaceConfig) -> tuple[RaceConfig, list[Driver]]:
+    """Return a task as this driver needs it, on one track, and its opponents.
+
+    Raises OutlapError for an observation term that does not exist, and for opponents that cannot be loaded.
+    """
+    check_terms(driver.observation_terms, driver.name)
+    opponents: list[Driver] = []
+    if config.num_cars > 1:
+        opponents = find_drivers(config.opponents, config.field_of_view, config.opponent_split, config.opponent_code)
     shown = driver.reward or config.reward
     assert isinstance(shown, RewardConfig)
-    settings["reward"] = _without_reference(shown)
-    others: list[Driver] = []
-    if config.num_cars > 1:
-        others = find_drivers(config.opponents, config.field_of_view, config.opponent_split, config.opponent_code)
-        settings["opponents"] = others  # found once, and not by the environment again
-    if not any("scan" in each.observation_terms for each in (driver, *others)):
-        settings["beams"] = 0  # nobody looks
-    return settings
+    changes: dict[str, Any] = {
+        "augment_tracks": False,  # the track that was named, not one of its variants
+        "observation": tuple(driver.observation_terms),
+        "scale_observations": driver.scale_observations,
+        "reward": shown.without_curricula(),
+    }
+    if not any("scan" in each.observation_terms for each in (driver, *opponents)):
+        changes["beams"] = 0  # nobody looks
+    return config.model_copy(update=changes), opponents
 
 
 def single_race(driver: Driver, config: RaceConfig, track: Track) -> RaceVectorEnv:
@@ -281,21 +283,18 @@ def single_race(driver: Driver, config: RaceConfig, track: Track) -> RaceVectorE
 
     Raises OutlapError for a task that the driver does not take.
     """
-    settings = {**episode_settings(driver, config, track), "beams": config.beams}
-    env = RaceVectorEnv(1, **settings, autoreset_mode=AutoresetMode.DISABLED)
+    task, opponents = episode_task(driver, config)
+    task = task.model_copy(update={"beams": config.beams})
+    env = RaceVectorEnv(1, task, [track], opponents, autoreset_mode=AutoresetMode.DISABLED)
     driver.check(env.single_observation_space)
     return env
-
-
-def _without_reference(reward: RewardConfig) -> RewardConfig:
-    return reward.model_copy(update={"weights": {**reward.weights, "velocity_matching": 0.0}})
 
 
 class _Score:
     """Rewards of a task in races that show the driver another reward."""
 
     def __init__(self, wanted: RewardConfig, shown: RewardConfig, worlds: int) -> None:
-        self.config = _without_reference(wanted)
+        self.config = wanted.without_curricula()
         self.weights = None if self.config == shown else self.config.resolved()
         self.returns = np.zeros(worlds)
 
@@ -303,9 +302,7 @@ class _Score:
         """The reward of the last step and the return so far: (worlds,) each."""
         if self.weights is None:
             return rewards, info["episode_return"]
-        last = np.zeros(len(self.returns))
-        for name, weight in self.weights.items():
-            last += weight * REWARD_TERMS[name](race, EGO, self.config)
+        last = np.zeros(len(self.returns)) + sum(weighted_terms(race, EGO, self.config, self.weights).values())
         self.returns += last
         return last, self.returns
 

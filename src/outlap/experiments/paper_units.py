@@ -214,10 +214,11 @@ class ClippingUnit(Unit):
 
 def collecting(unit: TrainingUnit, task: Task, work: Path, seed: int):
     """The environment that an adaptation collects from: as in training, but for the task."""
+    from outlap.envs.race_vector_env import RaceVectorEnv
     from outlap.envs.sb3_vec_env import SB3VecEnv
 
     env = changed(unit.config.env, task.changes, {"tracks": [task.track], "augment_tracks": False})
-    worlds = SB3VecEnv(COLLECTING_WORLDS, **dict(resolve(env, unit.population, work)))
+    worlds = SB3VecEnv(RaceVectorEnv(COLLECTING_WORLDS, resolve(env, unit.population, work)))
     worlds.env.training_steps = unit.config.total_steps  # curricula go on where training ended
     worlds.seed(COLLECTING_SEED + seed)
     return worlds

@@ -10,6 +10,7 @@ import torch
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog  # type: ignore[attr-defined]
 
+from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.files import remove_partials
@@ -45,7 +46,7 @@ def train(
         torch.set_num_threads(config.threads)
     # Every error in the configuration is found here, before the folder is made.
     check_device(config.device)
-    environment = SB3VecEnv(config.num_envs, **dict(config.env))
+    environment = SB3VecEnv(RaceVectorEnv(config.num_envs, config.env))
     if config.held_out_tracks:
         TaskSplit(environment.env.tasks, TaskSet(load_tracks(config.held_out_tracks)))
     model = None if resume else config.make_model(environment)

@@ -11,8 +11,9 @@ from outlap.envs.actions import driver_actions
 from outlap.envs.frame import Frame, between, cast_of, frame_of
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
+from outlap.envs.rewards import CURRICULA_OVER
 from outlap.evaluation.recording import how_it_ended
-from outlap.evaluation.rollout import CURRICULA_OVER, single_race
+from outlap.evaluation.rollout import single_race
 from outlap.track.track import Track
 from outlap.viewer.scene import Entry, Trail, pygame
 from outlap.viewer.window import FRAMES_PER_SECOND, LOOKING, Window, key_of
