@@ -25,7 +25,6 @@ UPWARDS: set[str] = set()
 IN_CYCLES: set[str] = set()
 LONG_MODULES: set[str] = {"outlap.mql.buffers"}
 LONG_FUNCTIONS: set[str] = {
-    "outlap.cli.adapt.run",
     "outlap.cli.evaluate.evaluate_into",
     "outlap.evaluation.rollout._race",
     "outlap.mql.adaptation.adapt",

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from filelock import FileLock
 
+from one_process import OneProcess
 from outlap.cli.main import main
 from outlap.evaluation.metrics import summarise_methods
 from outlap.evaluation.recording import Recording
@@ -38,6 +39,13 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "run"
 
 
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Adaptations in this process."""
+    monkeypatch.setattr("outlap.experiments.workers.ProcessPoolExecutor", OneProcess)
+
+
+@pytest.mark.usefixtures("one_process")
 def test_train_evaluate_and_adapt(run: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "run", "--tracks", "ring6", "--episodes", "3", "--time-limit", "2", "--quiet"]) == 0
     capfd.readouterr()
@@ -66,30 +74,29 @@ def test_train_evaluate_and_adapt(run: Path, capfd: pytest.CaptureFixture[str]) 
     assert main(["plot", "contexts", "adapted", "--out", "contexts.png"]) == 0
 
 
+@pytest.mark.usefixtures("one_process")
 def test_an_adaptation_goes_on_where_it_was_interrupted(
     run: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["adapt", "run", "--tracks", "ring6", "--seeds", "2", "--clip", "none", "abc", *SHORT, "--record", "1"]
-    words += ["--time-limit", "2", "--quiet"]
+    words += ["--time-limit", "2", "--jobs", "1", "--quiet"]
     assert main([*words, "--out", "whole"]) == 0
     raced: list[str] = []
 
-    def interrupted_in_the_third(driver, *arguments):
+    def interrupted_in_the_third(driver, *arguments, **keywords):
         raced.append(driver.name)
         if len(raced) == 3:
             raise KeyboardInterrupt
-        return evaluate(driver, *arguments)
+        return evaluate(driver, *arguments, **keywords)
 
     monkeypatch.setattr("outlap.evaluation.rollout.evaluate", interrupted_in_the_third)
     capfd.readouterr()
     assert main(words) == 130
     (folder,) = Path("run/adaptations").iterdir()
-    again = "outlap adapt run --tracks ring6 --clip none abc --seeds 2 --iterations 1 --collect-steps 10"
+    again = "outlap adapt run --jobs 1 --tracks ring6 --clip none abc --seeds 2 --iterations 1 --collect-steps 10"
     again += f" --collect-worlds 2 --replay-steps 2 --episodes 3 --time-limit 2.0 --record 1 --out {folder}"
     assert f"saved; go on with: {again}\n" in capfd.readouterr()[1]
-    assert main([*words, "--out", str(folder), "--seeds", "3"]) == 2
-    assert "was begun with other settings" in capfd.readouterr()[1]
-    with FileLock(folder / "parts" / ".lock"):
+    with FileLock(folder / "work" / ".lock"):
         assert main([*words, "--out", str(folder)]) == 2
     assert "another process is at work there" in capfd.readouterr()[1]
     assert main([*again.split()[1:], "--quiet"]) == 0
@@ -97,10 +104,11 @@ def test_an_adaptation_goes_on_where_it_was_interrupted(
     for name in ("episodes.parquet", "updates.parquet"):
         pd.testing.assert_frame_equal(pd.read_parquet(folder / name), pd.read_parquet(Path("whole") / name))
     assert {path.name for path in folder.rglob("*")} == {path.name for path in Path("whole").rglob("*")}
-    assert main([*words, "--out", str(folder)]) == 2
-    assert "must be an empty or a new folder" in capfd.readouterr()[1]
+    assert main([*words, "--out", str(folder), "--seeds", "3"]) == 0
+    assert raced[6:] == ["none", "abc"]  # only what is new
 
 
+@pytest.mark.usefixtures("one_process")
 def test_adapting_goes_on_with_the_rewards_that_training_ended_with(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     began_at = []
 
@@ -131,9 +139,9 @@ def test_a_folder_of_somebody_else_is_left_as_it_is(run: Path, capfd: pytest.Cap
     assert main([*words, "car"]) == 2
     assert "car: is there already; must be an empty or a new folder" in capfd.readouterr()[1]
     assert drawing.exists()
-    # What a process leaves that was killed before it had noted anything is no work of anybody.
-    Path("killed/parts").mkdir(parents=True)
-    Path("killed/parts/.lock").touch()
+    # The command continues in what a process leaves that was killed before it had done anything.
+    Path("killed/work").mkdir(parents=True)
+    Path("killed/work/.lock").touch()
     assert main([*words, "killed", "--seeds", "1", "--clip", "none", "--time-limit", "1"]) == 0
 
 

@@ -8,11 +8,21 @@ import pytest
 
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
-from outlap.experiments.definitions import FOLDERS, Budget, Circuits, Method, TaskSet, changed, find, merge, names_of
+from outlap.experiments.definitions import (
+    FOLDERS,
+    Budget,
+    Circuits,
+    Method,
+    TaskSetConfig,
+    changed,
+    find,
+    merge,
+    names_of,
+)
 from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN
 
 
-@pytest.mark.parametrize("kind", [Method, TaskSet, Budget])
+@pytest.mark.parametrize("kind", [Method, TaskSetConfig, Budget])
 def test_everything_that_comes_with_outlap_can_be_loaded_by_its_name(kind):
     names = names_of(kind)
     assert names == sorted(path.stem for path in FOLDERS[kind].glob("*.yaml"))
@@ -80,7 +90,7 @@ def test_an_environment_is_changed_and_a_wrong_field_named():
 
 def test_circuits_are_the_first_that_are_all_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("OUTLAP_TRACKS", str(tmp_path))
-    _, tracks = find(TaskSet, "tracks")
+    _, tracks = find(TaskSetConfig, "tracks")
     builtin = tracks.circuits[-1]
     assert {*builtin.train} <= {*BUILTIN_TRAIN}
     assert {*builtin.held_out} <= {*BUILTIN_HELD_OUT}
@@ -95,7 +105,7 @@ def test_circuits_are_the_first_that_are_all_there(tmp_path: Path, monkeypatch: 
 
 
 def test_no_circuit_is_both_trained_on_and_held_out():
-    for name in names_of(TaskSet):
-        for circuits in find(TaskSet, name)[1].circuits:
+    for name in names_of(TaskSetConfig):
+        for circuits in find(TaskSetConfig, name)[1].circuits:
             assert isinstance(circuits, Circuits)
             assert not {*circuits.train} & {*circuits.held_out}

@@ -29,8 +29,6 @@ def check_ended(ended: Ended, command: str, said: str) -> None:
     assert ended.code in (130, -signal.SIGINT)  # 130 to a shell, both of them
     assert ended.seconds < SOON
     assert "Traceback" not in ended.said
-    if ended.said == "\noutlap: interrupted\n":  # in an import, which takes too long for a word on a slow machine
-        return
     assert said in ended.said
     assert ended.said.endswith(f"outlap {command}: interrupted\n")
 
@@ -89,19 +87,20 @@ search: {gamma: [0.9, 0.99]}
 def test_a_search_goes_on_with_the_same_command(
     commands: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("ray", reason="needs Ray: pip install 'outlap[distributed]'")
+    pytest.importorskip("optuna", reason="needs Optuna: pip install 'outlap[tune]'")
     (tmp_path / "search.yaml").write_text(SEARCH)
     words = ["tune", "search.yaml", "--out", "out", "--jobs", "1", "--quiet"]
-    monkeypatch.setenv("RAY_worker_niceness", "0")  # or they wait for the tests beside these
-    ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out/tune/*/checkpoint_*"), within=0.5)
+    ended = commands.ended_by(
+        signal.SIGINT, words, tmp_path, exists(tmp_path, "out/work/rungs/*/checkpoints/step_*.zip"), within=0.5
+    )
     check_ended(ended, "tune", "saved; go on with the same command\n")
     assert not (tmp_path / "out" / "trials.parquet").exists()
     monkeypatch.chdir(tmp_path)
     assert main(words) == 0
     found = pd.read_parquet(tmp_path / "out" / "trials.parquet")
     assert sorted(found["trial"]) == [0, 1]
-    (first,) = (tmp_path / "out/tune").glob("*trial=0*/checkpoint_*")
-    assert len(load_run(first).record()["resumed"]) == 1
+    resumed = [load_run(path).record().get("resumed", []) for path in (tmp_path / "out/work/rungs").iterdir()]
+    assert sorted(map(len, resumed)) == [0, 1]
 
 
 @pytest.fixture(scope="module")
@@ -112,15 +111,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("command", "flags"), [("evaluate", ["--episodes", "100_000"]), ("adapt", ["--episodes", "100_000"])]
-)
-def test_races_leave_nothing_half_done(
-    command: str, flags: list[str], run: Path, commands: Commands, tmp_path: Path
-) -> None:
-    words = [command, str(run), "--tracks", "Foxglove", *flags, "--time-limit", "2", "--out", "out", "--quiet"]
-    ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out"), within=1.0)
-    check_ended(ended, command, f"{NOTHING_KEPT}\n")
+def test_races_leave_nothing_half_done(run: Path, commands: Commands, tmp_path: Path) -> None:
+    words = ["evaluate", str(run), "--tracks", "Foxglove", "--episodes", "100_000", "--time-limit", "2", "--out", "out"]
+    ended = commands.ended_by(signal.SIGINT, [*words, "--quiet"], tmp_path, exists(tmp_path, "out"), within=1.0)
+    check_ended(ended, "evaluate", f"{NOTHING_KEPT}\n")
     assert not any(tmp_path.glob("out/*"))  # so that the same command can begin again
 
 
@@ -138,6 +132,6 @@ def test_adaptations_that_are_done_are_kept(run: Path, commands: Commands, tmp_p
         "10",
     ]
     words += ["--episodes", "2", "--record", "1", "--time-limit", "2", "--out", "out", "--quiet"]
-    ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out/parts/*-episodes.parquet"), 1.0)
+    ended = commands.ended_by(signal.SIGINT, words, tmp_path, exists(tmp_path, "out/work/adaptations/*/done.json"), 1.0)
     check_ended(ended, "adapt", f"saved; go on with: outlap adapt {run} ")
     assert leftovers(tmp_path / "out") == []

@@ -19,7 +19,7 @@ from outlap.cli.interrupts import NOTHING_KEPT
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
 from outlap.cli.races import RaceFlags, check_positive, held_out_tracks, is_run, unused
-from outlap.cli.recordings import RECORDINGS, record_episodes, with_recordings
+from outlap.cli.recordings import with_recordings
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -97,6 +97,8 @@ class Evaluate(RaceFlags, LongCommand):
         )
         if not self.record:
             return result
+        from outlap.evaluation.recording import RECORDINGS, record_episodes
+
         number = min(self.record, self.episodes)
         with self.progress("recording", number * len(tracks), "episodes") as update:
             done: list[Path] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,43 +20,17 @@ from outlap.errors import OutlapError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from outlap.drivers.driver import Driver
-    from outlap.envs.race_config import RaceConfig
     from outlap.evaluation.recording import Recording
     from outlap.track import Track
     from outlap.training.run import Run
 
-RECORDINGS = "recordings"  # folder of them in that of an evaluation
 Episodes = Annotated[Positional[tuple[str, ...]], arg(metavar="EPISODE")]
-
-
-def record_episodes(
-    driver: Driver,
-    env: RaceConfig,
-    track: Track,
-    seed: int,
-    number: int,
-    folder: Path,
-    title: str | None = None,
-    suffix: str = "",
-    on_recorded: Callable[[Path], None] | None = None,
-) -> None:
-    """Race the first episodes of a track again, which `evaluate` has with this seed, and keep each in a folder.
-
-    A file is called TRACK-EPISODE, and `suffix` after that.
-    """
-    from outlap.evaluation.recording import SUFFIX, record_episode
-    from outlap.evaluation.rollout import episode_seeds
-
-    for episode, own in enumerate(episode_seeds(seed, track.name, number).tolist()):
-        recording = record_episode(driver, env, track, own, title)
-        path = recording.save(folder / f"{track.name.replace('/', '-')}-{episode:03d}{suffix}{SUFFIX}")
-        if on_recorded is not None:
-            on_recorded(path)
 
 
 def with_recordings(result: CommandResult, folder: Path, track: Track) -> CommandResult:
     """A command's result that says where its recordings are, and how to look at a track's first episode."""
+    from outlap.evaluation.recording import RECORDINGS
+
     place = folder / RECORDINGS
     first = f"{shlex.quote(f'{place / track.name}-000')}*"
 
@@ -156,7 +130,7 @@ def recording_files(name: str) -> list[Path]:
 
     Raises OutlapError for a folder without any that is no run either.
     """
-    from outlap.evaluation.recording import SUFFIX
+    from outlap.evaluation.recording import RECORDINGS, SUFFIX
 
     path = Path(name)
     if path.suffix == SUFFIX:

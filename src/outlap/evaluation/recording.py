@@ -24,12 +24,13 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import CURRICULA_OVER
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError, brief
-from outlap.evaluation.rollout import episode_task, single_race, standing_starts
+from outlap.evaluation.rollout import episode_seeds, episode_task, single_race, standing_starts
 from outlap.files import atomic_write
 from outlap.simulator import state as column
 from outlap.track.track import Track
 
 SUFFIX = ".npz"
+RECORDINGS = "recordings"  # folder of them in that of an evaluation
 LARGEST_FILE = 512 * 2**20  # bytes, unpacked, that a recording may have
 
 
@@ -207,6 +208,37 @@ def record_episode(
         terms=terms,
     )
     return watcher.recording(words)
+
+
+def record_episodes(
+    driver: Driver,
+    env: RaceConfig,
+    track: Track,
+    seed: int,
+    number: int,
+    folder: Path,
+    title: str | None = None,
+    suffix: str = "",
+    on_recorded: Callable[[Path], None] | None = None,
+) -> None:
+    """Race and record the first episodes of a track again, those of `evaluate` with this seed.
+
+    Args:
+        driver: who drives.
+        env: the races.
+        track: where.
+        seed: of the evaluation.
+        number: of episodes.
+        folder: for the recordings, TRACK-EPISODE and `suffix` each.
+        title: see `record_episode`.
+        suffix: of the names of the files.
+        on_recorded: called with each file.
+    """
+    for episode, own in enumerate(episode_seeds(seed, track.name, number).tolist()):
+        recording = record_episode(driver, env, track, own, title)
+        path = recording.save(folder / f"{track.name.replace('/', '-')}-{episode:03d}{suffix}{SUFFIX}")
+        if on_recorded is not None:
+            on_recorded(path)
 
 
 class _Watcher:

@@ -80,7 +80,7 @@ class Table(Config):
     published: dict[str, Published] = Field(default={})  # by method
 
 
-class TaskSet(Config):
+class TaskSetConfig(Config):
     """What is trained on, and the tables of what is tested."""
 
     title: str
@@ -114,10 +114,10 @@ class Budget(Config):
     gradient_batches: int = Field(default=32, ge=2)  # over which the variance of the gradient is taken
 
 
-DefinitionT = TypeVar("DefinitionT", Method, TaskSet, Budget)
+DefinitionT = TypeVar("DefinitionT", Method, TaskSetConfig, Budget)
 FOLDERS: dict[type[Config], Path] = {
     Method: HERE / "methods",
-    TaskSet: HERE / "task_sets",
+    TaskSetConfig: HERE / "task_sets",
     Budget: HERE / "budgets",
 }
 
@@ -138,7 +138,8 @@ def find(kind: type[DefinitionT], name: str) -> tuple[str, DefinitionT]:
     packaged = FOLDERS[kind] / f"{name}.yaml"
     if not packaged.is_file():
         known = ", ".join(names_of(kind))
-        raise OutlapError(f"{kind.__name__.lower()} is {name!r}; must be a .yaml file, or one of {known}")
+        what = FOLDERS[kind].name.removesuffix("s").replace("_", " ")
+        raise OutlapError(f"{what} is {name!r}; must be a .yaml file, or one of {known}")
     return name, load_config(kind, packaged)
 
 

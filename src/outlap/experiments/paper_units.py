@@ -22,6 +22,7 @@ from outlap.training.config import TrainingConfig
 from outlap.training.run import load_meta
 
 if TYPE_CHECKING:
+    from outlap.envs.sb3_vec_env import SB3VecEnv
     from outlap.mql.adaptation import AdaptationSettings
     from outlap.mql.mql import MQL
     from outlap.training.run import Run
@@ -212,16 +213,21 @@ class ClippingUnit(Unit):
             write_rows(rows.assign(**facts), self.folder(work) / f"{name}.parquet")
 
 
-def collecting(unit: TrainingUnit, task: Task, work: Path, seed: int):
-    """The environment that an adaptation collects from: as in training, but for the task."""
+def collecting(unit: TrainingUnit, task: Task, work: Path, seed: int) -> SB3VecEnv:
+    """Return the environment that an adaptation collects from: as in training, but for the task."""
+    env = changed(unit.config.env, task.changes, {"tracks": [task.track], "augment_tracks": False})
+    return collecting_env(resolve(env, unit.population, work), COLLECTING_WORLDS, unit.config.total_steps, seed)
+
+
+def collecting_env(env: RaceConfig, worlds: int, training_steps: int, seed: int) -> SB3VecEnv:
+    """Return an environment to collect from, whose curricula are where the training ended."""
     from outlap.envs.race_vector_env import RaceVectorEnv
     from outlap.envs.sb3_vec_env import SB3VecEnv
 
-    env = changed(unit.config.env, task.changes, {"tracks": [task.track], "augment_tracks": False})
-    worlds = SB3VecEnv(RaceVectorEnv(COLLECTING_WORLDS, resolve(env, unit.population, work)))
-    worlds.env.training_steps = unit.config.total_steps  # curricula go on where training ended
-    worlds.seed(COLLECTING_SEED + seed)
-    return worlds
+    collecting = SB3VecEnv(RaceVectorEnv(worlds, env))
+    collecting.env.training_steps = training_steps
+    collecting.seed(COLLECTING_SEED + seed)
+    return collecting
 
 
 def adaptation_settings(changes: Mapping[str, Any]) -> AdaptationSettings:

@@ -13,7 +13,7 @@ from outlap.drivers.find import find_drivers
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
-from outlap.experiments.definitions import Budget, Circuits, Method, TaskSet, changed, find, merge, names_of
+from outlap.experiments.definitions import Budget, Circuits, Method, TaskSetConfig, changed, find, merge, names_of
 from outlap.experiments.opponent_units import OpponentUnit, PopulationUnit
 from outlap.experiments.paper_units import POPULATION, ClippingUnit, RaceUnit, Task, TrainingUnit, adaptation_settings
 from outlap.experiments.unit import Unit
@@ -49,7 +49,7 @@ class Plan:
     budget_name: str
     budget: Budget
     methods: dict[str, Method]
-    task_sets: dict[str, TaskSet]
+    task_sets: dict[str, TaskSetConfig]
     circuits: dict[str, Circuits]  # that are used, by task set
     tables: tuple[TablePlan, ...]
     clipping: tuple[ClippingUnit, ...]  # of figure 2 and the appendix's histograms
@@ -79,7 +79,7 @@ class Plan:
 
 def artefacts() -> list[str]:
     """Names of everything that can be made."""
-    tables = [name for each in names_of(TaskSet) for name in find(TaskSet, each)[1].tables]
+    tables = [name for each in names_of(TaskSetConfig) for name in find(TaskSetConfig, each)[1].tables]
     return [*sorted(tables), FIGURE_2, APPENDIX, ALL]
 
 
@@ -123,7 +123,7 @@ class _Planner:
     def __init__(self, budget_name: str, methods: Sequence[str], seeds: int | None, run_code: bool) -> None:
         self.budget_name, budget = find(Budget, budget_name)
         self.budget = budget if seeds is None else budget.model_copy(update={"seeds": seeds})
-        self.task_sets = dict(find(TaskSet, name) for name in names_of(TaskSet))
+        self.task_sets = dict(find(TaskSetConfig, name) for name in names_of(TaskSetConfig))
         self._trainings: dict[tuple[str, str, int], TrainingUnit] = {}
         # Those that the paper has come first.
         tables = [table for task_set in self.task_sets.values() for table in task_set.tables.values()]
@@ -147,7 +147,7 @@ class _Planner:
             raise OutlapError(f"nothing to make; name some of {', '.join(artefacts())}, or a .yaml")
         files = [name for name in wanted if name.endswith((".yaml", ".yml"))]
         for file in files:
-            name, task_set = find(TaskSet, file)
+            name, task_set = find(TaskSetConfig, file)
             taken = [table for other in self.task_sets.values() for table in other.tables]
             for known_name in (name, *task_set.tables):
                 if known_name in (*self.task_sets, *taken):
@@ -155,7 +155,7 @@ class _Planner:
                         f"{file}: a task set or table is called {known_name} already; give it another name"
                     )
             self.task_sets[name] = task_set
-        own = {table for file in files for table in find(TaskSet, file)[1].tables}
+        own = {table for file in files for table in find(TaskSetConfig, file)[1].tables}
         known = [name for task_set in self.task_sets.values() for name in task_set.tables]
         for name in wanted:
             if name not in (*files, *known, FIGURE_2, APPENDIX, ALL):

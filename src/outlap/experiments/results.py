@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from outlap.config import bounds
 from outlap.envs.terminations import CRASH
 from outlap.evaluation.results import ROWS
 from outlap.evaluation.statistics import (
@@ -135,17 +136,12 @@ def table_result(plan: Plan, table: TablePlan, rows: pd.DataFrame) -> TableResul
     }
     cells = {
         method: {
-            metric: _cell(
-                scores[metric][method],
-                of_method[method],
-                METRICS[metric],
-                definition.published.get(method),
-            )
+            metric: _cell(scores[metric][method], of_method[method], METRICS[metric], definition.published.get(method))
             for metric in metrics
         }
         for method in plan.methods
     }
-    top = table.races[0].time_limit * _top_speed(table)
+    top = table.races[0].time_limit * bounds(table.races[0].env.vehicle.v_max)[1]
     return TableResult(
         table,
         definition.title,
@@ -181,32 +177,18 @@ def _cell(scores: np.ndarray, rows: pd.DataFrame, metric: Metric, published: Pub
 
 
 def _comparisons(methods: Mapping[str, Method], scores: Mapping[str, Mapping[str, np.ndarray]]) -> list[Comparison]:
+    pairs = [(name, other) for name, method in methods.items() for other in method.against if other in methods]
     found = []
-    for name, method in methods.items():
-        for other in method.against:
-            if other not in methods:
-                continue
-            for metric in (each for each in scores if METRICS[each].better):
-                better = METRICS[metric].better
-                a, b = scores[metric][name], scores[metric][other]
-                difference = paired_difference(a, b)
-                probability = probability_of_improvement(better * a, better * b)
-                low, high = probability_of_improvement_interval(better * a, better * b)
-                claim = claim_of(better * difference.low, better * difference.high)
-                found.append(
-                    Comparison(
-                        metric,
-                        name,
-                        other,
-                        difference.mean,
-                        difference.low,
-                        difference.high,
-                        probability,
-                        low,
-                        high,
-                        claim,
-                    )
-                )
+    for name, other in pairs:
+        for metric in (each for each in scores if METRICS[each].better):
+            better = METRICS[metric].better
+            a, b = scores[metric][name], scores[metric][other]
+            difference = paired_difference(a, b)
+            ends = difference.low, difference.high
+            probability = probability_of_improvement(better * a, better * b)
+            interval = probability_of_improvement_interval(better * a, better * b)
+            claim = claim_of(*(better * end for end in ends))
+            found.append(Comparison(metric, name, other, difference.mean, *ends, probability, *interval, claim))
     return found
 
 
@@ -220,24 +202,16 @@ def claim_of(one_end: float, other_end: float) -> str:
     return "not shown"
 
 
-def _top_speed(table: TablePlan) -> float:
-    from outlap.config import bounds
-
-    return bounds(table.races[0].env.vehicle.v_max)[1]
-
-
 def entries(result: TableResult) -> dict[str, Any]:
-    """For JSON: one entry a method and metric."""
+    """Return the numbers of a table for JSON, by method and metric."""
     return {
-        method: {
-            metric: {
-                "value": cell.mean, "low": cell.low, "high": cell.high, "seeds": cell.seeds, "sd": cell.sd,
-                "iqm": cell.iqm, "iqm_low": cell.iqm_low, "iqm_high": cell.iqm_high, "published": cell.published,
-            }
-            for metric, cell in row.items()
-        }
+        method: {metric: {"value": cell.mean, **_without_mean(cell)} for metric, cell in row.items()}
         for method, row in result.cells.items()
-    }  # fmt: skip
+    }
+
+
+def _without_mean(cell: Cell) -> dict[str, Any]:
+    return {name: value for name, value in asdict(cell).items() if name != "mean"}
 
 
 def ratio_over_adaptations(updates: pd.DataFrame, rule: str, reference: str, column: str) -> dict[str, Any]:
