@@ -15,7 +15,7 @@ from outlap.training.run import load_run
 
 pytestmark = pytest.mark.slow
 
-SOON = 10.0  # [s]; benchmarks/interrupts.py measures it
+SOON = 10.0  # [s]
 SMALL = [
     "--env.tracks", "Foxglove", "--env.no-augment-tracks", "--env.beams", "8", "--num-envs", "4", "--threads", "1",
 ]  # fmt: skip

@@ -6,13 +6,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from tyro.conf import FlagCreatePairsOff
-
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult
 
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(LongCommand):
     """Meta-train a policy on the built-in training circuits; race it on three that it never saw, adapt, race again.
 
     The same as `outlap train mql` and `outlap adapt --clip abc` with their defaults, but shorter, and the penalty for
@@ -30,12 +29,6 @@ class Demo:
 
     out: Path | None = None
     """The run folder; by default a new one under runs/."""
-
-    quiet: FlagCreatePairsOff[bool] = False
-    """Show no progress."""
-
-    json: str | None = None
-    """Write the result as JSON to this file; - for standard output."""
 
     def run(self) -> CommandResult:
         from outlap.cli.adapt import Adapt

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -11,23 +10,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
 from outlap.cli.command import Command, LongCommand
 from outlap.cli.output import CommandResult
 from outlap.cli.work import WorkCommand
-from outlap.drivers.population import Split, load_population, read_manifest
+from outlap.drivers.population import read_manifest
 from outlap.errors import OutlapError
 from outlap.training.opponents import opponent_defaults
 from outlap.training.ppo import PPOConfig
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.console import Console
-
-    from outlap.training.opponents import Opponent
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class TrainOpponents(WorkCommand):
     """Of its verification."""
 
     def run(self) -> CommandResult:
-        from outlap.experiments.opponent_units import OpponentUnit, enter_all
+        from outlap.experiments.opponent_units import OpponentUnit, enter_all, name_opponents, verification_row
         from outlap.track import load_track
 
         check_least("--laps", self.laps, 1)
@@ -66,7 +61,7 @@ class TrainOpponents(WorkCommand):
         self.check_flags()
         track = load_track(self.track)
         folder = self.out or Path("populations") / track.name
-        opponents = _opponents(track.name, _span(self.speeds), self.held_out)
+        opponents = name_opponents(track.name, _span(self.speeds), self.held_out)
         units = [
             OpponentUnit(each.name, self.settings, self.track, each.max_speed_mps, each.split, self.laps, self.starts)
             for each in opponents
@@ -74,7 +69,7 @@ class TrainOpponents(WorkCommand):
         self.do_units(units, folder / "work", "training")
         command = shlex.join(["outlap", *sys.argv[1:]])
         entered = enter_all(units, folder / "work", folder, command)
-        rows = [_row(unit.opponent, found, member is not None) for unit, found, member in entered]
+        rows = [verification_row(unit.opponent, found, member is not None) for unit, found, member in entered]
         data = {"folder": folder, "opponents": rows}
         return CommandResult(data, lambda console: _print(console, rows, folder))
 
@@ -138,25 +133,6 @@ class ListOpponents(Command):
         return CommandResult({"opponents": rows}, lambda console: _print(console, rows, folder))
 
 
-def _opponents(track: str, speeds: Sequence[float], held_out: Sequence[float]) -> list[Opponent]:
-    """Those to train, named after their track and top speed."""
-    from outlap.training.opponents import SLOWEST, Opponent
-
-    halves: tuple[tuple[Split, Sequence[float]], ...] = (("train", speeds), ("held_out", held_out))
-    prefix = re.sub(r"[^\w.-]+", "-", track)
-    opponents = [Opponent(f"{prefix}-{speed:.1f}", speed, split) for split, half in halves for speed in half]
-    names = [opponent.name for opponent in opponents]
-    for opponent in opponents:
-        if not SLOWEST < opponent.max_speed_mps < math.inf:
-            raise OutlapError(f"a top speed is {opponent.max_speed_mps}; must be more than {SLOWEST} m/s")
-        if names.count(opponent.name) > 1:
-            raise OutlapError(
-                f"two opponents would be called {opponent.name}; name each top speed once, in --speeds or --held-out, "
-                "0.1 m/s or more apart"
-            )
-    return opponents
-
-
 def _span(text: str) -> list[float]:
     """first:last:step as the numbers that it means."""
     try:
@@ -183,40 +159,14 @@ class VerifyOpponents(LongCommand):
     """Standing starts anywhere on the lap."""
 
     def run(self) -> CommandResult:
-        from outlap.track import load_track
-        from outlap.training.opponents import Opponent, enter, verify
+        from outlap.experiments.opponent_units import verify_population
 
         check_least("--laps", self.laps, 1)
         check_least("--starts", self.starts, 1)
-        members = {member.name: member for member in read_manifest(self.folder)}
-        drivers = load_population(self.folder, split=None)
-        rows = []
-        with self.progress("verifying", len(drivers), "opponents") as update:
-            for driver in drivers:
-                member = members[driver.name]
-                track = load_track(member.track)
-                found = verify(driver, PPOConfig().env, track, self.laps, self.starts)
-                opponent = Opponent(member.name, member.max_speed_mps, member.split)
-                kept = enter(self.folder, opponent, found, member.track, self.laps, member.command)
-                rows.append(_row(opponent, found, kept is not None))
-                update(len(rows), driver.name)
+        with self.progress("verifying", len(read_manifest(self.folder)), "opponents") as update:
+            rows = verify_population(self.folder, self.laps, self.starts, update)
         data = {"folder": self.folder, "opponents": rows}
         return CommandResult(data, lambda console: _print(console, rows, self.folder))
-
-
-def _row(opponent: Opponent, rows: pd.DataFrame, verified: bool) -> dict[str, Any]:
-    from outlap.training.opponents import crash_rate
-
-    lap_times = rows["lap_time_s"].to_numpy()
-    return {
-        "name": opponent.name,
-        "max_speed_mps": opponent.max_speed_mps,
-        "split": opponent.split,
-        "verified": verified,
-        "verified_laps": int(rows["completed_laps"].to_numpy().min()),
-        "crash_rate": crash_rate(rows),
-        "lap_time_s": None if np.isnan(lap_times).all() else float(np.nanmean(lap_times)),
-    }
 
 
 def _print(console: Console, rows: Sequence[dict[str, Any]], folder: Path) -> None:

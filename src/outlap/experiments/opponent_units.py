@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from outlap.drivers.population import Member, file_names
+from outlap.drivers.population import Member, Split, file_names, load_population, read_manifest
 from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.unit import Report, Unit
 from outlap.files import replacing
 from outlap.track.catalog import load_track
-from outlap.training.opponents import Opponent, enter, train_opponent, verify
+from outlap.training.opponents import SLOWEST, Opponent, crash_rate, enter, train_opponent, verify
 from outlap.training.ppo import PPOConfig
 
 COMMAND = "outlap reproduce"  # for the manifest of a population that an experiment trains
@@ -104,3 +108,65 @@ def enter_all(
         rows = pd.read_parquet(unit.folder(work) / ROWS)
         found.append((unit, rows, enter(folder, unit.opponent, rows, str(rows["track"].iloc[0]), unit.laps, command)))
     return found
+
+
+def name_opponents(track: str, speeds: Sequence[float], held_out: Sequence[float]) -> list[Opponent]:
+    """Return the opponents to train, named after their track and top speed.
+
+    Args:
+        track: its name.
+        speeds: top speeds [m/s] of those that training meets.
+        held_out: top speeds [m/s] of the others.
+
+    Raises OutlapError for a top speed that is not possible, or is there twice.
+    """
+    halves: tuple[tuple[Split, Sequence[float]], ...] = (("train", speeds), ("held_out", held_out))
+    prefix = re.sub(r"[^\w.-]+", "-", track)
+    opponents = [Opponent(f"{prefix}-{speed:.1f}", speed, split) for split, half in halves for speed in half]
+    names = [opponent.name for opponent in opponents]
+    for opponent in opponents:
+        if not SLOWEST < opponent.max_speed_mps < math.inf:
+            raise OutlapError(f"a top speed is {opponent.max_speed_mps}; must be more than {SLOWEST} m/s")
+        if names.count(opponent.name) > 1:
+            raise OutlapError(
+                f"two opponents would be called {opponent.name}; name each top speed once, in --speeds or --held-out, "
+                "0.1 m/s or more apart"
+            )
+    return opponents
+
+
+def verify_population(
+    folder: Path, laps: int, starts: int, on_verified: Callable[[int, str], None]
+) -> list[dict[str, Any]]:
+    """Verify the opponents of a population again, and remove those that fail from its manifest.
+
+    Args:
+        folder: of the population.
+        laps: see `verify`, as `starts`.
+        on_verified: called with the number of opponents that are verified, and the last one's name.
+
+    Returns:
+        See `verification_row`.
+    """
+    members = {member.name: member for member in read_manifest(folder)}
+    rows = []
+    for driver in load_population(folder, split=None):
+        member = members[driver.name]
+        found = verify(driver, PPOConfig().env, load_track(member.track), laps, starts)
+        opponent = Opponent(member.name, member.max_speed_mps, member.split)
+        kept = enter(folder, opponent, found, member.track, laps, member.command)
+        rows.append(verification_row(opponent, found, kept is not None))
+        on_verified(len(rows), driver.name)
+    return rows
+
+
+def verification_row(opponent: Opponent, rows: pd.DataFrame, verified: bool) -> dict[str, Any]:
+    """Return the numbers of a verification."""
+    lap_times = rows["lap_time_s"].to_numpy()
+    return {
+        **asdict(opponent),
+        "verified": verified,
+        "verified_laps": int(rows["completed_laps"].to_numpy().min()),
+        "crash_rate": crash_rate(rows),
+        "lap_time_s": None if np.isnan(lap_times).all() else float(np.nanmean(lap_times)),
+    }

@@ -14,7 +14,7 @@ from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.errors import OutlapError
 from outlap.experiments.definitions import Budget, Circuits, Method, TaskSetConfig, changed, find, merge, names_of
-from outlap.experiments.opponent_units import OpponentUnit, PopulationUnit
+from outlap.experiments.opponent_units import OpponentUnit, PopulationUnit, name_opponents
 from outlap.experiments.paper_units import POPULATION, ClippingUnit, RaceUnit, Task, TrainingUnit, adaptation_settings
 from outlap.experiments.unit import Unit
 from outlap.files import atomic_write, to_json
@@ -284,12 +284,11 @@ class _Planner:
         base = opponent_defaults()
         content = merge(base.model_dump(mode="json"), self.budget.population, {"threads": 1})
         settings = validate(type(base), content, "population")
-        # The fastest first: if any fails its verification, it is one of them.
-        speeds = [(speed, "held_out") for speed in HELD_OUT_SPEEDS[::-1]]
-        speeds += [(speed, "train") for speed in TRAINING_SPEEDS[::-1]]
+        opponents = name_opponents(track, TRAINING_SPEEDS, HELD_OUT_SPEEDS)
+        opponents.sort(key=lambda opponent: -opponent.max_speed_mps)  # if any fails its verification, it is a fast one
         units = tuple(
-            OpponentUnit(f"{track}-{speed:.1f}", settings, track, speed, split, self.budget.population_laps)
-            for speed, split in speeds
+            OpponentUnit(each.name, settings, track, each.max_speed_mps, each.split, self.budget.population_laps)
+            for each in opponents
         )
         return PopulationUnit(track, units)
 

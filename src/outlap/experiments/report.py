@@ -58,18 +58,16 @@ def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
     document = Document(folder)
     document.clear()
     (folder / ROWS).unlink(missing_ok=True)
-    document.text(f"# outlap: the paper's experiments, budget `{plan.budget_name}`")
-    document.text(_introduction(plan, work))
+    document.text(f"# outlap: the paper's experiments, budget `{plan.budget_name}`", _introduction(plan, work))
     for result in results:
         _write_table(document, plan, work, result, titles)
     if len(results) > 0:
-        document.text("## How far every method comes")
         document.text(
+            "## How far every method comes",
             "Performance profiles: the share of trainings and tasks whose mean progress, as a share of what top speed "
-            "would give in the time, is above τ."
+            "would give in the time, is above τ.",
         )
-        heading = "How far every method comes"
-        document.figure("profiles", figures.draw_profiles(results, titles, heading))
+        document.figure("profiles", figures.draw_profiles(results, titles, "How far every method comes"))
         _write_effort(document, results, titles, work)
     data: dict[str, Any] = {"tables": {result.plan.name: entries(result) for result in results}}
     data["comparisons"] = {result.plan.name: [asdict(each) for each in result.comparisons] for result in results}
@@ -120,25 +118,20 @@ def _write_table(document: Document, plan: Plan, work: Path, result: TableResult
     )
     if race.population is not None:
         document.text(_verification(race.population.opponents, work))
-    paper = [
-        metric for metric in result.metrics if any(row[metric].published is not None for row in result.cells.values())
-    ]
-    ours = [metric for metric in result.metrics if metric not in paper]
+    paper = [name for name in result.metrics if any(row[name].published is not None for row in result.cells.values())]
+    ours = [name for name in result.metrics if name not in paper]
     if paper:
-        headings = ["method"]
-        for metric in paper:
-            headings += [METRICS[metric].heading, "the paper"]
-        rows = []
-        for method, row in result.cells.items():
-            line = [titles[method]]
-            for metric in paper:
-                line += [_value(row[metric], metric), _published(row[metric], metric)]
-            rows.append(line)
-        document.table(headings, rows)
+        document.table(
+            ["method", *(heading for name in paper for heading in (METRICS[name].heading, "the paper"))],
+            [
+                [titles[method], *(text for name in paper for text in (_value(row[name], name), _published(row[name])))]
+                for method, row in result.cells.items()
+            ],
+        )
     document.table(
-        ["method", *(METRICS[metric].heading for metric in ours), "IQM of progress [m]"],
+        ["method", *(METRICS[name].heading for name in ours), "IQM of progress [m]"],
         [
-            [titles[method], *(_value(row[metric], metric) for metric in ours), _iqm(row["progress_m"])]
+            [titles[method], *(_value(row[name], name) for name in ours), _iqm(row["progress_m"])]
             for method, row in result.cells.items()
         ],
     )
@@ -163,7 +156,7 @@ def _interval(low: float, high: float, digits: int) -> str:
     return "" if low != low else f"[{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def _published(cell: Cell, metric: str) -> str:
+def _published(cell: Cell) -> str:
     if cell.published is None:
         return ""
     if isinstance(cell.published, tuple):
@@ -193,18 +186,18 @@ def _read_clipping(plan: Plan, work: Path, name: str) -> pd.DataFrame:
 
 
 def _write_clipping(document: Document, plan: Plan, work: Path) -> dict[str, Any]:
-    """Figure 2: numbers of every rule, and ABC's against the others'."""
+    """Write figure 2; return the numbers of every rule, and ABC's against the others'."""
     updates, gradients = _read_clipping(plan, work, "updates"), _read_clipping(plan, work, "gradients")
     iterations = _read_clipping(plan, work, "iterations")
     unit = ["seed", "adaptation_seed", "rule"]
     of_losses = updates.pivot_table(index=unit, values="critic_loss", aggfunc="var").reset_index()
     title = f"Figure 2: what clipping does to adaptation; {plan.circuits[CLIPPING_TASKS].title}"
-    document.text(f"## {title}")
     document.text(
+        f"## {title}",
         f"{len(plan.clipping)} adaptations to unseen circuits; for every clip rule the same transitions of the new "
         "circuit, the same replay and the same batches. The two panels at the upper left are of the weighted loss, as "
         "the paper's figure is; sample size and the gradient's variance do not change when all weights are scaled by "
-        "one constant. Lines: median over adaptations, with quartiles."
+        "one constant. Lines: median over adaptations, with quartiles.",
     )
     document.figure("figure-2", figures.draw_figure_2(updates, gradients, title))
     numbers = (
@@ -215,65 +208,75 @@ def _write_clipping(document: Document, plan: Plan, work: Path) -> dict[str, Any
         ("replay_td_error", "TD error of the replay, β = 1", updates, "td_error"),
         ("task_td_error", "TD error of the new circuit, β = 1", iterations, "on_task_critic_loss"),
     )
-    found: dict[str, Any] = {}
-    values, comparisons = [], []
-    for name, label, source, column in numbers:
-        paper = PAPER_VARIANCES if name == "loss_variance" else {}
-        medians = {rule: float(np.median(source.loc[source["rule"] == rule, column].to_numpy())) for rule in CLIP_RULES}
-        found[name] = {rule: {"value": medians[rule], "published": paper.get(rule)} for rule in CLIP_RULES}
-        published = [f" (the paper: {paper[rule]:.3g})" if rule in paper else "" for rule in CLIP_RULES]
-        values.append(
-            [label, *(f"{medians[rule]:.3g}{note}" for rule, note in zip(CLIP_RULES, published, strict=True))]
-        )
-        for reference in ("none", "fixed"):
-            ratio = ratio_over_adaptations(source, "abc", reference, column)
-            theirs = paper["abc"] / paper[reference] if reference in paper else None
-            found[name][f"abc_over_{reference}"] = {**ratio, "published": theirs}
-            comparisons.append(
-                [
-                    label,
-                    figures.RULES[reference],
-                    f"{ratio['value']:.3g} [{ratio['low']:.3g}, {ratio['high']:.3g}]",
-                    f"{theirs:.2g}" if theirs else "",
-                    _ratio_claim(ratio),
-                ]
-            )
+    found = {
+        name: _clipping_numbers(source, column, PAPER_VARIANCES if name == "loss_variance" else {})
+        for name, _, source, column in numbers
+    }
+    labels = {name: label for name, label, *_ in numbers}
     document.text("Medians over all adaptations:")
-    document.table(["number", *(figures.RULES[rule] for rule in CLIP_RULES)], values)
+    document.table(
+        ["number", *(figures.RULES[rule] for rule in CLIP_RULES)],
+        [[labels[name], *(_median(each[rule]) for rule in CLIP_RULES)] for name, each in found.items()],
+    )
     document.text(
         f"ABC over another rule: geometric mean of the ratio [95 %]; the unit is the training, of which there are "
         f"{len({unit.seed for unit in plan.clipping})}. Below 1: ABC's is the smaller."
     )
-    document.table(["number", "ABC over", "ratio", "the paper", "shown"], comparisons)
+    document.table(
+        ["number", "ABC over", "ratio", "the paper", "shown"],
+        [
+            [labels[name], figures.RULES[reference], *_ratio(each[f"abc_over_{reference}"])]
+            for name, each in found.items()
+            for reference in ("none", "fixed")
+        ],
+    )
     return found
 
 
-def _ratio_claim(ratio: Mapping[str, float]) -> str:
-    if ratio["high"] < 1.0:
-        return "**smaller**"
-    return "**larger**" if ratio["low"] > 1.0 else "not shown"
+def _clipping_numbers(source: pd.DataFrame, column: str, paper: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+    """Return the median of a number for each clip rule, and ABC's ratio to the others, with what the paper has."""
+    found: dict[str, dict[str, Any]] = {}
+    for rule in CLIP_RULES:
+        median = float(np.median(source.loc[source["rule"] == rule, column].to_numpy()))
+        found[rule] = {"value": median, "published": paper.get(rule)}
+    for other in ("none", "fixed"):
+        published = paper["abc"] / paper[other] if other in paper else None
+        found[f"abc_over_{other}"] = {
+            **ratio_over_adaptations(source, "abc", other, column),
+            "published": published,
+        }
+    return found
+
+
+def _median(number: Mapping[str, Any]) -> str:
+    note = "" if number["published"] is None else f" (the paper: {number['published']:.3g})"
+    return f"{number['value']:.3g}{note}"
+
+
+def _ratio(ratio: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return a ratio with its interval, what the paper has, and what that shows."""
+    claim = "**smaller**" if ratio["high"] < 1.0 else "**larger**" if ratio["low"] > 1.0 else "not shown"
+    interval = f"{ratio['value']:.3g} [{ratio['low']:.3g}, {ratio['high']:.3g}]"
+    return interval, "" if ratio["published"] is None else f"{ratio['published']:.2g}", claim
 
 
 def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
-    document.text("## Appendix")
+    document.text("## Appendix", "### A: opponents of every top speed learn")
     if plan.opponents:
         curves = {
             f"{unit.max_speed_mps:g} m/s": [figures.read_learning(unit.run_folder(work))] for unit in plan.opponents
         }
-        document.text("### A: opponents of every top speed learn", _verification(plan.opponents, work))
+        document.text(_verification(plan.opponents, work))
         document.figure("appendix-a", figures.draw_learning(curves, "Appendix A: PPO for every top speed"))
     else:
-        document.text(
-            "### A: opponents of every top speed learn",
-            "Not in this budget: the opponents are those that come with outlap.",
-        )
-    for letter, key in zip("BCEF", APPENDIX_TITLES, strict=True):
+        document.text("Not in this budget: the opponents are those that come with outlap.")
+    for letter, (key, title) in zip("BCEF", APPENDIX_TITLES.items(), strict=True):
         units = plan.curves.get(key, ())
         if not units:
             continue
-        curves = {APPENDIX_TITLES[key]: [figures.read_learning(unit.folder(work)) for unit in units]}
-        document.text(f"### {letter}: {APPENDIX_TITLES[key].partition(': ')[2]}; {plan.circuits[key[0]].title}")
-        document.figure(f"appendix-{letter.lower()}", figures.draw_learning(curves, APPENDIX_TITLES[key]))
+        curves = {title: [figures.read_learning(unit.folder(work)) for unit in units]}
+        document.text(f"### {letter}: {title.partition(': ')[2]}; {plan.circuits[key[0]].title}")
+        document.figure(f"appendix-{letter.lower()}", figures.draw_learning(curves, title))
         if letter == "C":
             document.text("### D: β and ABC's β during adaptation")
             histograms, updates = _read_clipping(plan, work, "histograms"), _read_clipping(plan, work, "updates")
@@ -330,13 +333,12 @@ def _core_seconds(plan: Plan, work: Path) -> dict[str, float]:
 
 def _write_record(document: Document, plan: Plan, record: Mapping[str, Any]) -> None:
     """Command, machine, versions, and everything that was configured."""
-    machine, versions = record["machine"], record["versions"]
-    document.text("## How this was made")
-    document.text(f"```sh\n{record['command']}\n```")
+    machine = record["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     document.text(
-        f"{machine['processor']}, {machine['cores']} cores, {machine['system']}; "
-        + ", ".join(f"{name} {version}" for name, version in versions.items())
-        + "."
+        "## How this was made",
+        f"```sh\n{record['command']}\n```",
+        f"{machine['processor']}, {machine['cores']} cores, {machine['system']}; {versions}.",
     )
     document.table(
         ["work", "units", "core minutes"],
@@ -345,13 +347,11 @@ def _write_record(document: Document, plan: Plan, record: Mapping[str, Any]) -> 
             for kind, seconds in record["core_seconds"].items()
         ],
     )
-    settings = {"budget": plan.budget.model_dump(mode="json", exclude_defaults=True)}
-    settings["methods"] = {
-        name: method.model_dump(mode="json", exclude_defaults=True) for name, method in plan.methods.items()
-    }
-    document.text("### Configuration")
-    document.text(f"```yaml\n{yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)}```")
+    methods = {name: method.model_dump(mode="json", exclude_defaults=True) for name, method in plan.methods.items()}
+    settings = {"budget": plan.budget.model_dump(mode="json", exclude_defaults=True), "methods": methods}
     document.text(
+        "### Configuration",
+        f"```yaml\n{yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)}```",
         f"Every episode is a row of `{ROWS}`; all numbers are in `results.json`, task sets included. The run folder of "
-        "each training is under `work/trainings`."
+        "each training is under `work/trainings`.",
     )
