@@ -22,7 +22,7 @@ from typing import Any
 
 # Numba compiles these functions: it cannot read bytecode that counts its branches.
 COMPILED = [
-    "outlap.simulator", "outlap.seeding", "outlap.track.centerline", "outlap.track.distance",
+    "outlap.simulator", "outlap.track.distance",
     "outlap.planning.corridor", "outlap.planning.speed_profile", "outlap.mql.gather", "outlap.mql.gru",
     "outlap.mql.lanes", "outlap.mql.torch_threads",
 ]  # fmt: skip

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from outlap.simulator.kernels import Worlds
 from outlap.simulator.simulator import Simulator, SimulatorConfig
 from outlap.simulator.state import YAW, X, Y
 from outlap.simulator.vehicle import N_PARAMS, VehicleParams, parameter_bounds, to_records, to_values
+from outlap.simulator.worlds import Worlds
 from outlap.track.centerline import Centerline
 from outlap.track.track import Track
 
@@ -23,6 +23,20 @@ def circle(x: float, y: float, radius: float, half_width: float = 1.0) -> Center
     angle = np.linspace(0.0, 2.0 * math.pi, 256, endpoint=False)
     points = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=1)
     return Centerline.from_points(points, half_width, half_width)
+
+
+def wavy(count: int = 240) -> Centerline:
+    """A closed line with bends of both signs, radius down to about 2 m."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    radius = 20.0 + 3.0 * np.sin(5.0 * angle) + 1.0 * np.cos(3.0 * angle)
+    return Centerline.from_points(
+        np.column_stack([radius * np.cos(angle) + 7.0, radius * np.sin(angle) - 4.0]), 1.0, 1.2
+    )
+
+
+def circular(difference: np.ndarray, length: float) -> np.ndarray:
+    """A difference of arc lengths on a closed line, in [-length / 2, length / 2)."""
+    return (difference + 0.5 * length) % length - 0.5 * length
 
 
 def ring(radius: float = 8.0, half_width: float = 1.2, resolution: float = 0.05, yaw: float = 0.0) -> Track:

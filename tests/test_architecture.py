@@ -30,7 +30,6 @@ LONG_FUNCTIONS: set[str] = {
     "outlap.mql.adaptation.adapt",
     "outlap.mql.learner.td3_update",
     "outlap.mql.mql.__init__",
-    "outlap.simulator.simulator.__init__",
 }
 
 

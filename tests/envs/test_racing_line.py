@@ -12,7 +12,7 @@ import pytest
 from outlap.envs.racing_line import LINE_SPEED, racing_lines
 from outlap.simulator.atlas import FIRST_ROW, LINE_SPACING, ROWS, build_atlas
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
-from outlap.track.centerline import CURVATURE, Centerline
+from outlap.track.centerline import Centerline
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
 
@@ -77,7 +77,7 @@ def test_no_limit_is_broken_and_none_is_wasted(stadium, ellipse, mu, a_max):
     v_max = 9.0
     tracks = (stadium, ellipse)
     for track, speeds in zip(tracks, profile(*tracks, mu=mu, a_max=a_max, v_max=v_max), strict=True):
-        curvature = np.abs(track.centerline.table(LINE_SPACING)[:, CURVATURE])
+        curvature = np.abs(track.centerline.table(LINE_SPACING)["curvature"])
         squared = speeds.astype(float) ** 2
         step = 2.0 * track.centerline.length / len(speeds)
         grip = 0.8 * mu * GRAVITY

@@ -12,7 +12,7 @@ from outlap.config import bounds
 from outlap.envs.keywords import make_race_vector
 from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.errors import OutlapError
-from outlap.seeding import world_keys
+from outlap.simulator.seeding import world_keys
 from outlap.simulator.vehicle import (
     N_PARAMS,
     NAMES,

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from outlap.simulator.kernels import ARC_LENGTH, HEADING_ERROR, OFFSET
 from outlap.simulator.simulator import Simulator, SimulatorConfig
 from outlap.simulator.state import STEER, YAW, X, Y
+from outlap.simulator.worlds import ARC_LENGTH, HEADING_ERROR, OFFSET
 from synthetic_tracks import CAR, place, ring
 
 RADIUS = 8.0

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from outlap.errors import OutlapError
-from outlap.seeding import world_keys
+from outlap.simulator.seeding import world_keys
 
 
 class EpisodeSeeds:

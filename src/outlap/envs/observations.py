@@ -20,8 +20,7 @@ from outlap.envs.racing_line import LINE_SPEED, LINE_X, LINE_Y
 from outlap.errors import OutlapError
 from outlap.simulator import state as column
 from outlap.simulator.collision import REMOVED
-from outlap.simulator.kernels import HEADING_ERROR, OFFSET
-from outlap.track.centerline import CURVATURE
+from outlap.simulator.worlds import HEADING_ERROR, OFFSET
 
 INF = math.inf
 LINE_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)  # [m] along the centreline
@@ -79,7 +78,7 @@ def frenet(race: Race, car: int) -> np.ndarray:
 
 def curvature_ahead(race: Race, car: int) -> np.ndarray:
     """Curvature of the centreline [1/m] at CURVATURE_AHEAD. Needs the map."""
-    return race.line_values(car, CURVATURE, np.array(CURVATURE_AHEAD))
+    return race.line_values(car, "curvature", np.array(CURVATURE_AHEAD))
 
 
 def line_ahead(race: Race, car: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from outlap.envs.actions import driver_actions
 from outlap.envs.observations import check_terms, observe
 from outlap.envs.race import Race
 from outlap.errors import OutlapError
-from outlap.seeding import DRIVER_STREAM, NOISE_STREAM, uniform
+from outlap.simulator.seeding import DRIVER_STREAM, NOISE_STREAM, uniform
 
 LONGEST_EPISODE = 1 << 32  # steps: apart by so many, the noise of two episodes never meets
 

@@ -13,8 +13,8 @@ from outlap.envs.racing_line import ReferenceSpeeds
 from outlap.simulator import state as column
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
 from outlap.simulator.collision import FREE, REMOVED
-from outlap.simulator.kernels import ARC_LENGTH
 from outlap.simulator.simulator import Simulator
+from outlap.simulator.worlds import ARC_LENGTH
 
 EGO = 0
 RUNNING = ""  # the outcome of a race that goes on
@@ -97,9 +97,9 @@ class Race:
         row = np.rint(s / atlas.frame[track, SPACING, None]).astype(np.int64)
         return first[:, None] + row % rows[:, None]
 
-    def line_values(self, car: int, table_column: int, ahead: np.ndarray) -> np.ndarray:
-        """A column of the centreline table at distances ahead of a car [m]: (worlds, len(ahead))."""
-        return self.simulator.atlas.line[self.line_rows(car, ahead), table_column]
+    def line_values(self, car: int, name: str, ahead: np.ndarray) -> np.ndarray:
+        """Return a field of the centreline's table at distances ahead of a car [m]: (worlds, len(ahead))."""
+        return self.simulator.atlas.line[name][self.line_rows(car, ahead)]
 
     def begin(self, which: np.ndarray) -> None:
         """Take note of worlds that were just reset."""

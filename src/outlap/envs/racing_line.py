@@ -11,8 +11,6 @@ from outlap.planning.limits import Limits
 from outlap.planning.path import Path
 from outlap.planning.speed_profile import speed_profile, speed_profiles
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
-from outlap.track import centerline
-from outlap.track.centerline import CURVATURE
 from outlap.track.track import Track
 
 RacingLine = Literal["track", "min-curvature", "min-time"]
@@ -41,8 +39,8 @@ def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, ch
         spacing, here = atlas.frame[number, SPACING], out[first : first + rows]
         if choice == "track" and track.raceline is None:
             middle = atlas.line[first : first + rows]
-            here[:, [LINE_X, LINE_Y]] = middle[:, [centerline.X, centerline.Y]]
-            here[:, LINE_SPEED] = speed_profile(middle[:, CURVATURE], spacing, limits, GRIP_SHARE * limits.mu)
+            here[:, LINE_X], here[:, LINE_Y] = middle["x"], middle["y"]
+            here[:, LINE_SPEED] = speed_profile(middle["curvature"], spacing, limits, GRIP_SHARE * limits.mu)
             continue
         line = track.raceline if choice == "track" else kept_line(track, limits, choice).raceline
         assert line is not None

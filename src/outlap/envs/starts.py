@@ -10,11 +10,10 @@ from pydantic import Field
 from outlap.config import Config, Number, bounded, bounds
 from outlap.envs.race import EGO
 from outlap.errors import OutlapError
-from outlap.seeding import START_STREAM, uniform
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
 from outlap.simulator.collision import FREE
+from outlap.simulator.seeding import START_STREAM, uniform
 from outlap.simulator.simulator import Simulator
-from outlap.track.centerline import WIDTH_LEFT, WIDTH_RIGHT
 
 START_ATTEMPTS = 20
 MARGIN = 0.1  # [m] that a start leaves at least between the car and the track's edge, or the next car
@@ -115,7 +114,7 @@ def draw_starts(
     side = 2.0 * each[..., SIDE] - 1.0
     if config.formation == "grid":
         side = 1.0 - 2.0 * (_places(behind) % 2)
-    room = np.where(side > 0.0, atlas.line[row, WIDTH_LEFT], atlas.line[row, WIDTH_RIGHT]) - body
+    room = np.where(side > 0.0, atlas.line["width_left"][row], atlas.line["width_right"][row]) - body
     offset = side * np.maximum(room, 0.0) * config.offset * spread
     error = (2.0 * each[..., HEADING] - 1.0) * config.heading_error * spread
     low, high = bounds(config.speed)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from outlap.errors import OutlapError
-from outlap.seeding import PARAMETER_STREAM, TRACK_STREAM, uniform
+from outlap.simulator.seeding import PARAMETER_STREAM, TRACK_STREAM, uniform
 from outlap.simulator.vehicle import (
     N_PARAMS,
     ActuatorParams,

@@ -1,6 +1,6 @@
 """From commands to what the dynamics take: a steering rate and an acceleration, within the car's limits.
 
-Scalar functions of one car's parameter row `p`, applied once per integrator step.
+Scalar functions of one car's parameters `p`, applied once per integrator step.
 """
 
 from __future__ import annotations

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from outlap.track.centerline import TABLE_COLUMNS
 from outlap.track.track import Track
 
 STACK = 8  # cells in a word, one above the other
@@ -35,7 +34,7 @@ class Atlas(NamedTuple):
     """All tracks of a simulator."""
 
     words: np.ndarray  # uint32: WALL or clearance of all grids' cells, eight a word
-    line: np.ndarray  # float32 (rows, TABLE_COLUMNS): the centreline tables of all tracks
+    line: np.ndarray  # track.centerline.TABLE (rows,): the centreline tables of all tracks
     index: np.ndarray  # int64 (tracks, 5): where each track lies in the two above
     frame: np.ndarray  # float64 (tracks, 6): grid origin [m] and yaw, cell size and row spacing [m]
 
@@ -49,7 +48,6 @@ def build_atlas(tracks: Sequence[Track]) -> Atlas:
     for number, track in enumerate(tracks):
         cells = _pack_cells(track)
         line = track.centerline.table(LINE_SPACING)
-        assert line.shape[1] == TABLE_COLUMNS
         height, width = track.occupancy.shape
         index[number] = first_word, width + 2 * RING, height + 2 * RING, first_row, len(line)
         yaw = track.origin[2]

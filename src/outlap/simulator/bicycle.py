@@ -91,7 +91,7 @@ def kinematic_speed(p, dt, integrator=RK4):
     leaves the integrator's region of stability. At least 0.5 m/s, the F1TENTH gym's value.
 
     Args:
-        p: the car's parameter row.
+        p: the car's parameters.
         dt: physics step [s].
         integrator: EULER or RK4.
     """

@@ -1,10 +1,10 @@
 """Vehicle dynamics: one physics step of a car, under three models and two integrators.
 
 - KINEMATIC: wheels that never slip (`bicycle.kinematic`).
-- SINGLE_TRACK: linear tyres under load transfer; kinematic below KINEMATIC_SPEED (`bicycle.single_track`).
+- SINGLE_TRACK: linear tyres under load transfer; kinematic below `p.kinematic_speed` (`bicycle.single_track`).
 - DRIFT: Pacejka tyres with combined slip and spinning wheels (`drift.drift`).
 
-Scalar functions. A state is a tuple in the order of `state`, float64; `p` is one car's parameter row. The
+Scalar functions. A state is a tuple in the order of `state`, float64; `p` is one car's parameters. The
 inputs are within the car's limits (`actuators`) and constant over a step. No function calls NumPy: the same
 source compiles for CUDA.
 """
@@ -55,7 +55,7 @@ HIGHEST_WHEEL_SPEED = 1.2  # times v_max / wheel_radius: the motor's limit under
 def integrate(model, integrator, state, steer_rate, acceleration, dt, p):
     """A car's state after one physics step.
 
-    Where the wheels do not slip (the kinematic model; the single-track below KINEMATIC_SPEED), yaw rate
+    Where the wheels do not slip (the kinematic model; the single-track below `p.kinematic_speed`), yaw rate
     and slip angle are set to what the geometry says, so that no error builds up; without the drift model,
     wheel speeds follow the car's speed. The drift model takes as many internal steps as its stiff wheels
     and tyres need at the present speed (`drift.drift_substeps`).
@@ -67,7 +67,7 @@ def integrate(model, integrator, state, steer_rate, acceleration, dt, p):
         steer_rate: [rad/s] and
         acceleration: [m/s^2], within the car's limits, constant over the step.
         dt: [s].
-        p: the car's parameter row.
+        p: the car's parameters.
 
     Returns:
         The next state: yaw and slip in (-pi, pi]. Where tyres slip, yaw rate is within 50 rad/s; under SINGLE_TRACK

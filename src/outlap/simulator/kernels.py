@@ -7,12 +7,10 @@ worlds (`Worlds`), which it changes in place. Nothing is allocated.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from outlap.seeding import hash64
 from outlap.simulator import state as column
 from outlap.simulator.actuators import acceleration, delay_steps, lag, steering_rate
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
@@ -25,45 +23,10 @@ from outlap.simulator.dynamics import (
     rolling_wheel_speeds,
     wrap_angle,
 )
-from outlap.simulator.lidar import cast_car, cast_walls, spoil
-from outlap.track.centerline import frenet_point, frenet_project
-
-# Columns of Worlds.frenet
-ARC_LENGTH, OFFSET, HEADING_ERROR = range(3)
-
-
-class Constants(NamedTuple):
-    """What all worlds of a simulator share."""
-
-    model: int  # KINEMATIC, SINGLE_TRACK or DRIFT
-    integrator: int  # EULER or RK4
-    timestep: float  # [s] of physics
-    substeps: int  # integrator steps per physics step
-    beam_cos: np.ndarray  # float32, see `lidar.beam_directions`
-    beam_sin: np.ndarray
-
-
-class Worlds(NamedTuple):
-    """The state of every world; leading axes (worlds, cars)."""
-
-    key: np.ndarray  # uint64 (worlds,) of the random numbers of this episode
-    track: np.ndarray  # int32 (worlds,) number in the atlas
-    time: np.ndarray  # float64 (worlds,) since the reset [s]
-    tick: np.ndarray  # int64 (worlds,) physics steps since the reset
-    params: np.ndarray  # PARAMETERS (worlds, cars)
-    state: np.ndarray  # float32 (worlds, cars, N_STATE)
-    before: np.ndarray  # float32 (worlds, cars, 3): x, y, yaw one physics step ago
-    delayed: np.ndarray  # float32 (worlds, cars, slots, 2): ring of the latest commands
-    lagged: np.ndarray  # float32 (worlds, cars, 2): commands behind delay and lag
-    frenet: np.ndarray  # float64 (worlds, cars, 3): ARC_LENGTH [m], OFFSET [m], HEADING_ERROR [rad]
-    distance: np.ndarray  # float64 (worlds, cars): arc length driven from the start line, unwrapped [m]
-    next_line: np.ndarray  # int64 (worlds, cars): number of the next crossing of the start line
-    lap_start: np.ndarray  # float64 (worlds, cars): time of the last crossing [s]; NaN on the out-lap
-    laps: np.ndarray  # int64 (worlds, cars): laps completed, from line to line
-    lap_time: np.ndarray  # float64 (worlds, cars): of the last completed lap [s]; NaN before
-    contact: np.ndarray  # uint8 (worlds, cars): FREE, HIT_WALL, HIT_CAR or REMOVED; only a free car drives
-    impact_speed: np.ndarray  # float32 (worlds, cars): at the contact, relative to what was hit [m/s]
-    scan: np.ndarray  # float32 (worlds, cars, beams) [m]
+from outlap.simulator.frenet import frenet_point, frenet_project
+from outlap.simulator.lidar import apply_sensor_noise, cast_car, cast_walls
+from outlap.simulator.seeding import hash64
+from outlap.simulator.worlds import ARC_LENGTH, HEADING_ERROR, OFFSET
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -242,7 +205,7 @@ def _scan(atlas, constants, worlds, w, c):
                 0.5 * size.length, 0.5 * size.width, scan,
             )  # fmt: skip
     key = hash64(hash64(worlds.key[w], np.uint64(worlds.tick[w])), np.uint64(c))
-    spoil(p, key, scan)
+    apply_sensor_noise(p, key, scan)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -266,7 +229,7 @@ def step_worlds(atlas, constants, worlds, commands, repeats):
     """Advance every world by `repeats` physics steps under constant commands, then scan.
 
     Args:
-        atlas, constants, worlds: see above.
+        atlas, constants, worlds: see `atlas` and `worlds`.
         commands: (worlds, cars, 2) steering angle [rad] and speed [m/s].
         repeats: physics steps.
     """
@@ -340,7 +303,7 @@ def reset_worlds(atlas, constants, worlds, which, keys, tracks, params, starts):
     """Begin an episode in some worlds and scan.
 
     Args:
-        atlas, constants, worlds: see above.
+        atlas, constants, worlds: see `atlas` and `worlds`.
         which: (n,) indices of the worlds.
         keys: uint64 (n,) of their random numbers.
         tracks: (n,) numbers in the atlas.
@@ -376,7 +339,7 @@ def respawn_cars(atlas, constants, worlds, clearance):
     """Put removed cars back on the centreline where they left it, at rest.
 
     Args:
-        atlas, constants, worlds: see above.
+        atlas, constants, worlds: see `atlas` and `worlds`.
         clearance: [m] to the middle of every other car, without which a car goes on waiting.
     """
     for w in prange(worlds.state.shape[0]):

@@ -1,4 +1,4 @@
-"""A planar LiDAR: ray casting on walls and on other cars, then what is wrong with the ranges.
+"""A planar LiDAR: ray casting on walls and on other cars, then sensor noise.
 
 Walls: from a cell whose clearance is c, a ray may go to the cell's edge and c further before it can meet a
 wall. So every step passes at least one cell and never a wall, and the range is exact to a few thousandths of a
@@ -19,7 +19,6 @@ from llvmlite import ir
 from numba import carray, njit, types  # pyright: ignore[reportPrivateImportUsage]
 from numba.extending import intrinsic
 
-from outlap.seeding import hash64
 from outlap.simulator.atlas import (
     COS,
     FIRST_WORD,
@@ -31,6 +30,7 @@ from outlap.simulator.atlas import (
     cell_clearance,
     to_grid,
 )
+from outlap.simulator.seeding import hash64
 
 LANES = 8
 SLOTS = 4
@@ -218,13 +218,13 @@ def cast_car(x, y, yaw, beam_cos, beam_sin, other_x, other_y, other_yaw, half_le
 
 
 @njit(cache=True, error_model="numpy")
-def spoil(p, key, ranges_io):
+def apply_sensor_noise(p, key, ranges_io):
     """Add a car's sensor errors to its ranges: bias, Gaussian noise, dropout; then keep them in range.
 
     A beam that met nothing within the maximum range, or that drops out, reads the maximum range.
 
     Args:
-        p: the car's parameter row.
+        p: the car's parameters.
         key: uint64, new for every scan.
         ranges_io: (beams,) [m].
     """

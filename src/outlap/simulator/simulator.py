@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from outlap.config import Config
 from outlap.errors import OutlapError
@@ -15,13 +16,12 @@ from outlap.simulator.atlas import build_atlas
 from outlap.simulator.collision import REMOVED
 from outlap.simulator.dynamics import DRIFT, EULER, KINEMATIC, RK4, SINGLE_TRACK
 from outlap.simulator.lidar import beam_directions
-from outlap.simulator.state import N_STATE
 from outlap.simulator.vehicle import PARAMETERS, accepted_bounds, parameter_names, to_values
+from outlap.simulator.worlds import Constants, allocate_worlds
 from outlap.track.track import Track
 
 MODELS = {"kinematic": KINEMATIC, "single_track": SINGLE_TRACK, "drift": DRIFT}
 INTEGRATORS = {"euler": EULER, "rk4": RK4}
-MAX_BEAMS = 1080
 MAX_DELAY_STEPS = 1000
 MAX_COMMAND = 1e6  # beyond any stop and any speed, and far from where single precision ends
 
@@ -31,10 +31,10 @@ class SimulatorConfig(Config):
 
     model: Literal["kinematic", "single_track", "drift"] = "single_track"
     integrator: Literal["euler", "rk4"] = "rk4"
-    timestep: float = 0.01  # of physics [s]
-    substeps: int = 1  # integrator steps per physics step
-    beams: int = 540  # 0 to 1080
-    field_of_view: float = 4.7  # between the outermost beams [rad]
+    timestep: float = Field(default=0.01, gt=0, le=0.1)  # of physics [s]
+    substeps: int = Field(default=1, ge=1)  # integrator steps per physics step
+    beams: int = Field(default=540, ge=0, le=1080)
+    field_of_view: float = Field(default=4.7, gt=0, le=2 * np.pi)  # between the outermost beams [rad]
 
 
 class Simulator:
@@ -65,11 +65,6 @@ class Simulator:
         _check(len(tracks) >= 1, "tracks", len(tracks), "at least one track is needed")
         _check(num_worlds >= 1, "num_worlds", num_worlds, "it must be at least 1")
         _check(num_cars >= 1, "num_cars", num_cars, "it must be at least 1")
-        _check(0.0 < config.timestep <= 0.1, "timestep", config.timestep, "it must be in (0, 0.1] s")
-        _check(config.substeps >= 1, "substeps", config.substeps, "it must be at least 1")
-        _check(0 <= config.beams <= MAX_BEAMS, "beams", config.beams, f"it must be in [0, {MAX_BEAMS}]")
-        _check(0.0 < config.field_of_view <= 2.0 * np.pi, "field_of_view", config.field_of_view,
-               "it must be in (0, 2 pi] rad")  # fmt: skip
         _check(0.0 <= max_delay < np.inf, "max_delay", max_delay, "it must be 0 s or more")
         slots = round(max_delay / config.timestep) + 1
         _check(slots <= MAX_DELAY_STEPS, "max_delay", max_delay, f"at most {MAX_DELAY_STEPS} steps are kept")
@@ -78,32 +73,12 @@ class Simulator:
         self.num_worlds = num_worlds
         self.num_cars = num_cars
         self.atlas = build_atlas(self.tracks)
-        beam_cos, beam_sin = beam_directions(config.beams, config.field_of_view)
-        self._constants = kernels.Constants(
+        self.worlds = allocate_worlds(num_worlds, num_cars, slots, config.beams)
+        self._constants = Constants(
             MODELS[config.model], INTEGRATORS[config.integrator], config.timestep, config.substeps,
-            beam_cos, beam_sin,
+            *beam_directions(config.beams, config.field_of_view),
         )  # fmt: skip
         cars = (num_worlds, num_cars)
-        self.worlds = kernels.Worlds(
-            key=np.zeros(num_worlds, np.uint64),
-            track=np.zeros(num_worlds, np.int32),
-            time=np.zeros(num_worlds),
-            tick=np.zeros(num_worlds, np.int64),
-            params=np.zeros(cars, PARAMETERS),
-            state=np.zeros((*cars, N_STATE), np.float32),
-            before=np.zeros((*cars, 3), np.float32),
-            delayed=np.zeros((*cars, slots, 2), np.float32),
-            lagged=np.zeros((*cars, 2), np.float32),
-            frenet=np.zeros((*cars, 3)),
-            distance=np.zeros(cars),
-            next_line=np.zeros(cars, np.int64),
-            lap_start=np.zeros(cars),
-            laps=np.zeros(cars, np.int64),
-            lap_time=np.zeros(cars),
-            contact=np.zeros(cars, np.uint8),
-            impact_speed=np.zeros(cars, np.float32),
-            scan=np.zeros((*cars, config.beams), np.float32),
-        )
         self._commands = np.zeros((*cars, 2), np.float32)
         self._started = np.zeros(num_worlds, bool)
         self._called = set()  # kernels that have run

@@ -27,7 +27,7 @@ def tyre_forces(slip, slip_angle, load, p):
         slip: longitudinal slip (u - wheel_radius wheel_speed) / u [-].
         slip_angle: [rad].
         load: vertical force [N].
-        p: the car's parameter row.
+        p: the car's parameters.
 
     Returns:
         longitudinal, lateral [N].

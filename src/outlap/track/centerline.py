@@ -1,8 +1,7 @@
-"""The centreline: a closed cubic spline measured in metres along it, in Python and in kernels.
+"""The centreline: a closed cubic spline measured in metres along it.
 
-Frenet coordinates: `s` [m] along the line from the start line, `d` [m] to its left.
-`Centerline` works on arrays in float64. The kernels at the end work on one point and on a float32
-table of the same curve, from a starting guess, and hold no NumPy calls.
+Frenet coordinates: `s` [m] along the line from the start line, `d` [m] to its left. The simulator's kernels work on a
+float32 table of the same curve (`Centerline.table`).
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
@@ -20,8 +18,11 @@ from scipy.spatial import KDTree
 
 from outlap.errors import OutlapError
 
-X, Y, TANGENT_X, TANGENT_Y, CURVATURE, WIDTH_RIGHT, WIDTH_LEFT = range(7)
-TABLE_COLUMNS = 7
+TABLE = np.dtype(
+    [(name, np.float32) for name in ("x", "y", "tangent_x", "tangent_y", "curvature", "width_right", "width_left")],
+    align=True,
+)
+"""A row of `Centerline.table`: position [m], unit tangent, curvature [1/m] and free widths [m]."""
 
 MIN_POINTS = 4
 LONGEST = 1e5  # [m] of a lap, and of a coordinate
@@ -161,20 +162,19 @@ class Centerline:
         return s.reshape(shape), d.reshape(shape)
 
     def table(self, spacing: float = 0.1) -> np.ndarray:
-        """The line sampled uniformly in s: (m, TABLE_COLUMNS) float32, about `spacing` [m] apart.
+        """Return the line sampled uniformly in s, about `spacing` [m] apart: (m,) records of TABLE.
 
-        Row i is at s = i·h with h = length / m. Columns: X, Y, TANGENT_X, TANGENT_Y, CURVATURE,
-        WIDTH_RIGHT, WIDTH_LEFT.
+        Row i is at s = i·h with h = length / m.
         """
         if not (math.isfinite(spacing) and spacing > 0.0):
             raise OutlapError(f"centreline table: spacing is {spacing}; it must be a positive number of metres")
         rows = max(MIN_POINTS, math.ceil(self.length / spacing - 1e-9))
         s = np.arange(rows) * (self.length / rows)
-        table = np.empty((rows, TABLE_COLUMNS), dtype=np.float32)
-        table[:, X : Y + 1] = self.position(s)
-        table[:, TANGENT_X : TANGENT_Y + 1] = self._tangent(s)
-        table[:, CURVATURE] = self.curvature(s)
-        table[:, WIDTH_RIGHT], table[:, WIDTH_LEFT] = self.widths(s)
+        table = np.empty(rows, TABLE)
+        table["x"], table["y"] = self.position(s).T
+        table["tangent_x"], table["tangent_y"] = self._tangent(s).T
+        table["curvature"] = self.curvature(s)
+        table["width_right"], table["width_left"] = self.widths(s)
         return table
 
     def _chord_at(self, s: ArrayLike) -> np.ndarray:
@@ -282,107 +282,3 @@ def _fit(points: np.ndarray) -> tuple[CubicSpline, CubicHermiteSpline, np.ndarra
             "along the track"
         )
     return curve, CubicHermiteSpline(s, dense, 1.0 / speed), s[:-1:_PIECES].copy(), float(s[-1])
-
-
-# Kernels. `table` may hold many lines one after another: `row0` is the first row of this one, `rows`
-# their number and `h` the spacing [m]. Between rows the curve is the cubic Hermite segment of the two
-# positions and tangents.
-
-_MAX_STEP = 2.0  # [m] a Newton step is cut to this
-_MAX_ITERATIONS = 12
-_TOLERANCE = 1e-3  # [m] a step this small is the last: Newton's next would be its square
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _wrap(s, length):
-    """`s` brought into [0, length); 0 for what is not finite."""
-    if 0.0 <= s < length:  # nearly always, and a division cheaper
-        return s
-    s -= length * math.floor(s / length)
-    return s if 0.0 <= s < length else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def frenet_project(table, row0, rows, h, x, y, s_guess):
-    """The foot of the perpendicular from (x, y) [m] on the line near `s_guess` [m].
-
-    Returns (s in [0, length), d, heading of the tangent there). Newton's method on
-    (r(s) − p)·r'(s) = 0; outside the line's evolute it walks downhill instead. Finite for finite
-    input; never reads outside the table.
-    """
-    length = rows * h
-    inverse = 1.0 / h
-    # A first step from the row before the guess, along its tangent and circle, mostly ends within a
-    # centimetre and costs half of one on the curve.
-    i = min(int(_wrap(float(s_guess), length) * inverse), rows - 1)
-    a = row0 + i
-    away_x, away_y = x - table[a, X], y - table[a, Y]
-    ax, ay = float(table[a, TANGENT_X]), float(table[a, TANGENT_Y])
-    step = (away_x * ax + away_y * ay) / max(1.0 - table[a, CURVATURE] * (ax * away_y - ay * away_x), 0.2)
-    s = _wrap(i * h + (step if -_MAX_STEP < step < _MAX_STEP else 0.0), length)
-    velocity_x, velocity_y = 1.0, 0.0
-    bend_x = bend_y = 0.0
-    for _ in range(_MAX_ITERATIONS):
-        scaled = s * inverse
-        i = min(int(scaled), rows - 1)
-        t = scaled - i
-        a = row0 + i
-        b = row0 + (i + 1 if i + 1 < rows else 0)
-        chord_x = float(table[b, X]) - float(table[a, X])
-        chord_y = float(table[b, Y]) - float(table[a, Y])
-        ax, ay = h * table[a, TANGENT_X], h * table[a, TANGENT_Y]
-        bx, by = h * table[b, TANGENT_X], h * table[b, TANGENT_Y]
-        # r(t) = r_a + t·(a + t·(c2 + t·c3)), all derivatives with respect to t
-        c3x, c3y = ax + bx - 2.0 * chord_x, ay + by - 2.0 * chord_y
-        c2x, c2y = chord_x - ax - c3x, chord_y - ay - c3y
-        away_x = table[a, X] - x + t * (ax + t * (c2x + t * c3x))
-        away_y = table[a, Y] - y + t * (ay + t * (c2y + t * c3y))
-        velocity_x = ax + t * (2.0 * c2x + 3.0 * t * c3x)
-        velocity_y = ay + t * (2.0 * c2y + 3.0 * t * c3y)
-        bend_x = 2.0 * c2x + 6.0 * t * c3x
-        bend_y = 2.0 * c2y + 6.0 * t * c3y
-        squared = velocity_x * velocity_x + velocity_y * velocity_y
-        slope = away_x * velocity_x + away_y * velocity_y
-        second = squared + away_x * bend_x + away_y * bend_y
-        floor = 0.05 * squared  # where distance is not convex, take a bounded step downhill
-        step = -h * slope / (second if second > floor else max(-second, floor))
-        if not (step >= -_MAX_STEP):
-            step = -_MAX_STEP
-        elif step > _MAX_STEP:
-            step = _MAX_STEP
-        s = _wrap(s + step, length)
-        if -_TOLERANCE < step < _TOLERANCE:
-            break
-    # Carry the last evaluation over the last step.
-    t = step * inverse
-    if -1.0 < t < 1.0:
-        away_x += t * (velocity_x + 0.5 * t * bend_x)
-        away_y += t * (velocity_y + 0.5 * t * bend_y)
-        velocity_x += t * bend_x
-        velocity_y += t * bend_y
-    norm = 1.0 / math.sqrt(velocity_x * velocity_x + velocity_y * velocity_y)
-    d = (velocity_y * away_x - velocity_x * away_y) * norm
-    return s, d, math.atan2(velocity_y, velocity_x)
-
-
-@njit(cache=True, error_model="numpy")
-def frenet_point(table, row0, rows, h, s, d):
-    """The point `d` [m] left of the line at `s` [m]: (x, y, heading of the tangent)."""
-    s = _wrap(float(s), rows * h)
-    scaled = s / h
-    i = min(int(scaled), rows - 1)
-    t = scaled - i
-    a = row0 + i
-    b = row0 + (i + 1 if i + 1 < rows else 0)
-    chord_x = float(table[b, X]) - float(table[a, X])
-    chord_y = float(table[b, Y]) - float(table[a, Y])
-    ax, ay = h * table[a, TANGENT_X], h * table[a, TANGENT_Y]
-    bx, by = h * table[b, TANGENT_X], h * table[b, TANGENT_Y]
-    c3x, c3y = ax + bx - 2.0 * chord_x, ay + by - 2.0 * chord_y
-    c2x, c2y = chord_x - ax - c3x, chord_y - ay - c3y
-    velocity_x = ax + t * (2.0 * c2x + 3.0 * t * c3x)
-    velocity_y = ay + t * (2.0 * c2y + 3.0 * t * c3y)
-    norm = d / math.sqrt(velocity_x * velocity_x + velocity_y * velocity_y)
-    x = table[a, X] + t * (ax + t * (c2x + t * c3x)) - norm * velocity_y
-    y = table[a, Y] + t * (ay + t * (c2y + t * c3y)) + norm * velocity_x
-    return x, y, math.atan2(velocity_y, velocity_x)

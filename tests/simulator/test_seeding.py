@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from oracles import splitmix64
-from outlap.seeding import (
+from outlap.simulator.seeding import (
     DRIVER_STREAM,
     PARAMETER_STREAM,
     START_STREAM,
