@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
+from scipy import stats
 
 LEVEL = 0.95  # of every interval
 RESAMPLES = 2000
@@ -40,7 +40,7 @@ def estimate_mean(values: np.ndarray, level: float = LEVEL) -> Estimate:
     if n == 1:
         return Estimate(mean, math.nan, math.nan, math.nan)
     sd = float(values.std(ddof=1))
-    half = float(special.stdtrit(n - 1, 0.5 + 0.5 * level)) * sd / math.sqrt(n)
+    half = float(stats.t.ppf(0.5 + 0.5 * level, n - 1)) * sd / math.sqrt(n)
     return Estimate(mean, sd, mean - half, mean + half)
 
 
@@ -54,14 +54,8 @@ def wilson_interval(count: int, n: int, level: float = LEVEL) -> tuple[float, fl
         raise ValueError(f"count is {count}; must be between 0 and n = {n}")
     if n == 0:
         return math.nan, math.nan
-    z = float(special.ndtri(0.5 + 0.5 * level))
-    share = count / n
-    middle = (share + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    # In exact arithmetic the ends of 0 and n are 0 and 1.
-    low = 0.0 if count == 0 else max(0.0, middle - half)
-    high = 1.0 if count == n else min(1.0, middle + half)
-    return low, high
+    interval = stats.binomtest(count, n).proportion_ci(level, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 def interquartile_mean(values: np.ndarray) -> float:
@@ -69,9 +63,7 @@ def interquartile_mean(values: np.ndarray) -> float:
 
     Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice.
     """
-    ordered = np.sort(np.ravel(values))
-    cut = len(ordered) // 4
-    return float(ordered[cut : len(ordered) - cut].mean())
+    return float(stats.trim_mean(values, 0.25, axis=None))
 
 
 def stratified_bootstrap(
