@@ -76,13 +76,13 @@ def simulator(folder: Path) -> str:
 
 
 def raceline(folder: Path) -> str:
-    from outlap.planning.limits import Limits
+    from outlap.planning.limits import CarLimits
     from outlap.planning.plan import plan_line
     from outlap.simulator.vehicle import VehicleParams
     from outlap.track.generate import generate_track
 
     circuit = generate_track(1, length=60.0)
-    lines = [plan_line(circuit, Limits.of(VehicleParams(v_max=8.0)), how) for how in ("min-curvature", "min-time")]
+    lines = [plan_line(circuit, CarLimits.of(VehicleParams(v_max=8.0)), how) for how in ("min-curvature", "min-time")]
     return digest(*(array for line in lines for array in (line.path.points, line.speed)))
 
 

@@ -22,7 +22,7 @@ from pydantic import (
     field_validator,
 )
 
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, short_repr
 from outlap.files import atomic_write
 
 LONGEST_VALUE = 60  # characters of a wrong value that an error message repeats
@@ -260,8 +260,7 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 def _short(value: Any) -> str:
-    text = "empty" if value is None else repr(value)
-    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+    return "empty" if value is None else short_repr(value, LONGEST_VALUE)
 
 
 def _yaml_problem(error: Exception) -> str:

@@ -11,6 +11,12 @@ class OutlapError(ValueError):
     """
 
 
+def short_repr(value: object, longest: int = 80) -> str:
+    """Return the `repr` of a wrong value for an error message: at most `longest` characters."""
+    text = repr(value)
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."
+
+
 def brief(error: BaseException) -> str:
     """What an exception says, fit for one line: of a broken file it may hold any bytes, and any number of them."""
     words = " ".join(str(error).split()) or type(error).__name__

@@ -67,7 +67,7 @@ def races(draw: st.DrawFn) -> dict[str, Any]:
 def lines_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Planned lines are tested elsewhere, and take seconds: here every car is to race the centreline."""
     monkeypatch.setattr(
-        "outlap.envs.racing_line.kept_line",
+        "outlap.envs.racing_line.cached_line",
         lambda track, *_: SimpleNamespace(path=path_along(track.centerline, 0.5)),
     )
 

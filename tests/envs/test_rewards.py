@@ -11,8 +11,8 @@ from outlap.envs.keywords import make_race_vector
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import REWARD_PRESETS, REWARD_TERMS, RewardConfig
 from outlap.errors import OutlapError
-from outlap.planning.kept import kept_line
-from outlap.planning.limits import Limits
+from outlap.planning.limits import CarLimits
+from outlap.planning.line_cache import cached_line
 from outlap.planning.plan import DEFAULT_MARGIN
 from outlap.simulator.atlas import FIRST_ROW, ROWS
 from outlap.track.generate import generate_track
@@ -220,7 +220,7 @@ def test_the_reference_is_that_of_the_place_and_of_the_track():
     atlas = race.simulator.atlas
     for world, number in enumerate(race.worlds.track.tolist()):
         track, (first, rows) = tracks[number], atlas.index[number, [FIRST_ROW, ROWS]]
-        line = kept_line(track, Limits.of_record(race.worlds.params[world, 0]))
+        line = cached_line(track, CarLimits.of_record(race.worlds.params[world, 0]))
         at, _ = track.centerline.to_frenet(*line.path.points.T)
         for row in range(0, rows, 40):
             everyone = np.full(8, atlas.index[race.worlds.track, FIRST_ROW])

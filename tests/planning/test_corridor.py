@@ -10,13 +10,13 @@ import pytest
 from oracles import grid_to_world
 from outlap.errors import OutlapError
 from outlap.planning.corridor import corridor, wall_margin
-from outlap.planning.limits import Limits
+from outlap.planning.limits import CarLimits
 from outlap.planning.path import path_along
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track import Track
 from synthetic_tracks import ring
 
-CAR = Limits.of(VehicleParams())
+CAR = CarLimits.of(VehicleParams())
 
 
 def cells_to_point(track: Track, x: float, y: float) -> float:

@@ -19,8 +19,8 @@ from outlap.errors import OutlapError
 from outlap.evaluation.rollout import evaluate, standing_starts
 from outlap.planning import min_time
 from outlap.planning.friction import FrictionMap
-from outlap.planning.kept import kept_line
-from outlap.planning.limits import Limits
+from outlap.planning.limits import CarLimits
+from outlap.planning.line_cache import cached_line
 from outlap.planning.min_laps import min_laps
 from outlap.planning.plan import DEFAULT_MARGIN, METHODS, PlannedLine, plan_line
 from outlap.simulator.vehicle import VehicleParams
@@ -31,7 +31,7 @@ from outlap.track.map_io import read_raceline_csv, write_raceline_csv
 from outlap.track.walls import draw_walls
 from synthetic_tracks import ring
 
-CAR = Limits.of(VehicleParams(v_max=8.0))
+CAR = CarLimits.of(VehicleParams(v_max=8.0))
 
 
 def drawn(name: str, points: np.ndarray, half_width: float) -> Track:
@@ -192,11 +192,11 @@ def test_ctrl_c_stops_the_solver_and_is_no_planning_error(circuit):
     """IPOPT would take it for an error of its own, and the rounds for one that there is no room."""
     code = (
         "import signal, threading, sys, os\n"
-        "from outlap.planning import plan\nfrom outlap.planning.limits import Limits\n"
+        "from outlap.planning import plan\nfrom outlap.planning.limits import CarLimits\n"
         "from outlap.simulator.vehicle import VehicleParams\nfrom outlap.track.generate import generate_track\n"
         "track = generate_track(11, length=300.0)\n"
         "plan.log.info = lambda *words: words[-1] == 1 and threading.Timer(1.0, os.kill, (os.getpid(), 2)).start()\n"
-        "try:\n    plan.plan_line(track, Limits.of(VehicleParams()))\n"
+        "try:\n    plan.plan_line(track, CarLimits.of(VehicleParams()))\n"
         "except KeyboardInterrupt:\n    sys.exit(7)\n"
     )
     done = subprocess.run(
@@ -221,7 +221,7 @@ def test_limits_that_make_no_sense_are_refused():
 def test_a_kept_line_is_the_same_and_a_broken_file_is_planned_anew(tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("OUTLAP_CACHE", str(tmp_path))
     track = ring(4.0)
-    first, second = kept_line(track, CAR), kept_line(track, CAR)
+    first, second = cached_line(track, CAR), cached_line(track, CAR)
     np.testing.assert_array_equal(first.path.points, second.path.points)
     assert (first.lap_time, first.solve_time) == (second.lap_time, second.solve_time), "planned once"
     (file,) = tmp_path.rglob("*.npz")
@@ -230,16 +230,16 @@ def test_a_kept_line_is_the_same_and_a_broken_file_is_planned_anew(tmp_path, mon
     needed = whole.index(b"PK\x01\x02") + 6  # version of ZIP, of the first member in the archive's directory
     for broken in (whole[:100], whole[:needed] + b"\x5d" + whole[needed + 1 :]):
         file.write_bytes(broken)
-        assert kept_line(track, CAR).solve_time != first.solve_time
+        assert cached_line(track, CAR).solve_time != first.solve_time
         assert "is made anew" in caplog.records.pop().message
-    assert kept_line(track, replace(CAR, mu=0.5)).lap_time > first.lap_time
+    assert cached_line(track, replace(CAR, mu=0.5)).lap_time > first.lap_time
     assert len(list(tmp_path.rglob("*.npz"))) == 2
 
 
 def test_the_yardstick_of_one_car_is_its_planned_lap(circuit):
     table = min_laps(circuit, VehicleParams(v_max=8.0))
     assert table.error == 0.0
-    assert table.of([CAR])[0] == pytest.approx(kept_line(circuit, CAR).lap_time, rel=1e-9)
+    assert table.of([CAR])[0] == pytest.approx(cached_line(circuit, CAR).lap_time, rel=1e-9)
 
 
 def test_the_yardstick_of_a_car_that_is_drawn_is_the_lap_planned_for_it(circuit):

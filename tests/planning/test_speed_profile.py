@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from outlap.planning.limits import Limits
+from outlap.planning.limits import CarLimits
 from outlap.planning.speed_profile import lap_time, speed_profile
 from outlap.simulator.vehicle import VehicleParams
 
-CAR = Limits.of(VehicleParams())
+CAR = CarLimits.of(VehicleParams())
 SPACING = 0.05
 
 

@@ -15,7 +15,7 @@ from outlap.errors import OutlapError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from outlap.planning.limits import Limits
+    from outlap.planning.limits import CarLimits
     from outlap.simulator.vehicle import VehicleParams
     from outlap.track import Track
 
@@ -112,16 +112,16 @@ class PlanRaceline(LongCommand):
 
         return CommandResult(data, show)
 
-    def _limits(self, track: Track) -> Limits:
-        from outlap.planning.limits import Limits
+    def _limits(self, track: Track) -> CarLimits:
+        from outlap.planning.limits import CarLimits
         from outlap.simulator.vehicle import VehicleParams
 
         if self.vehicle == "track":
             if track.raceline is None:
                 raise OutlapError(f"--vehicle is 'track'; {track.name} has no raceline that could ask anything")
-            limits = Limits.of(VehicleParams()).implied_by(track.raceline)
+            limits = CarLimits.of(VehicleParams()).implied_by(track.raceline)
         else:
-            limits = Limits.of(find_vehicle(self.vehicle))
+            limits = CarLimits.of(find_vehicle(self.vehicle))
         changes = {name: value for name in ("v_max", "mu", "a_max") if (value := getattr(self, name)) is not None}
         if self.a_max is not None or self.a_brake is not None:
             changes["a_brake"] = self.a_brake or self.a_max

@@ -6,9 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from outlap.planning.kept import kept_line
-from outlap.planning.limits import Limits
-from outlap.planning.path import Path
+from outlap.planning.limits import CarLimits
+from outlap.planning.line_cache import cached_line
+from outlap.planning.path import ClosedPath
 from outlap.planning.speed_profile import speed_profile, speed_profiles
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
 from outlap.track.track import Track
@@ -32,7 +32,7 @@ def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, ch
 
     Raises OutlapError for a track on which none can be planned.
     """
-    limits = Limits.of_record(params)
+    limits = CarLimits.of_record(params)
     out = np.empty((len(atlas.line), 3), np.float32)
     for number, track in enumerate(tracks):
         first, rows = atlas.index[number, FIRST_ROW], atlas.index[number, ROWS]
@@ -42,7 +42,7 @@ def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, ch
             here[:, LINE_X], here[:, LINE_Y] = middle["x"], middle["y"]
             here[:, LINE_SPEED] = speed_profile(middle["curvature"], spacing, limits, GRIP_SHARE * limits.mu)
             continue
-        line = track.raceline if choice == "track" else kept_line(track, limits, choice).raceline
+        line = track.raceline if choice == "track" else cached_line(track, limits, choice).raceline
         assert line is not None
         at, _ = track.centerline.to_frenet(line.x, line.y)
         for column, values in ((LINE_X, line.x), (LINE_Y, line.y), (LINE_SPEED, line.speed)):
@@ -66,8 +66,8 @@ class ReferenceSpeeds:
 
         Raises OutlapError for a track on which none can be planned.
         """
-        limits = Limits.of_record(params)
-        self._lines = [kept_line(track, limits).path.resampled(PROFILE_SPACING) for track in tracks]
+        limits = CarLimits.of_record(params)
+        self._lines = [cached_line(track, limits).path.resampled(PROFILE_SPACING) for track in tracks]
         rows = atlas.index[:, ROWS]
         self._beside = [
             _points_beside(track, line, int(count))
@@ -92,7 +92,7 @@ class ReferenceSpeeds:
         return self._speed[np.arange(len(rows)), car, rows - self._first_row[track]]
 
 
-def _points_beside(track: Track, line: Path, rows: int) -> np.ndarray:
+def _points_beside(track: Track, line: ClosedPath, rows: int) -> np.ndarray:
     """The point of a line that lies beside each row of a centreline's table: (rows,)."""
     at, _ = track.centerline.to_frenet(*line.points.T)
     order = np.argsort(at, kind="stable")

@@ -27,7 +27,7 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import CURRICULA_OVER, RewardConfig, weighted_terms
 from outlap.envs.terminations import CRASH, TerminationConfig
 from outlap.errors import OutlapError
-from outlap.planning.limits import Limits
+from outlap.planning.limits import CarLimits
 from outlap.planning.min_laps import min_laps
 from outlap.simulator.vehicle import parameter_bounds, parameter_names, to_records
 from outlap.track.catalog import load_tracks
@@ -249,7 +249,9 @@ def _with_lap_time_ratios(
         except OutlapError as problem:  # of the yardstick alone: what was raced is worth no less
             log.warning("no lap_time_ratio: %s", problem)
         else:
-            cars = [Limits.of_record(to_records(vehicle)) for vehicle, lap in zip(vehicles, lapped, strict=True) if lap]
+            cars = [
+                CarLimits.of_record(to_records(vehicle)) for vehicle, lap in zip(vehicles, lapped, strict=True) if lap
+            ]
             least[lapped], error[lapped] = table.of(cars), table.error
     for row, seconds, part in zip(rows, least.tolist(), error.tolist(), strict=True):
         row |= {"min_lap_time_s": seconds, "lap_time_ratio": row["lap_time_s"] / seconds, "min_lap_error": part}

@@ -63,7 +63,7 @@ def interquartile_mean(values: np.ndarray) -> float:
 
     Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice.
     """
-    return float(stats.trim_mean(values, 0.25, axis=None))
+    return float(stats.trim_mean(np.ravel(values), 0.25))
 
 
 def stratified_bootstrap(

@@ -15,8 +15,8 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from outlap.errors import OutlapError
-from outlap.planning.limits import Limits
-from outlap.planning.path import Path
+from outlap.planning.limits import CarLimits
+from outlap.planning.path import ClosedPath
 from outlap.track.track import Track
 
 LATERAL_STEP = 0.02  # [m] between places that are tried; less than a pixel of any map
@@ -26,7 +26,7 @@ EXACT = 1e-3  # [m] to which the ends are found
 BODY_STEP = 0.03  # [m] between points of the car's body
 
 
-def corridor(track: Track, path: Path, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def corridor(track: Track, path: ClosedPath, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """How far a disc may move sideways from each point of a line.
 
     What counts is the map; the centreline's widths only say where a track ends that has no wall there.
@@ -55,7 +55,7 @@ def corridor(track: Track, path: Path, radius: float) -> tuple[np.ndarray, np.nd
     return right, left
 
 
-def wall_margin(track: Track, path: Path, body: Limits) -> np.ndarray:
+def wall_margin(track: Track, path: ClosedPath, body: CarLimits) -> np.ndarray:
     """The distance from the car's body to the nearest wall, all along a line: (n,) [m], negative where it is in one."""
     half_length, half_width = 0.5 * body.length, 0.5 * body.width
     step = min(BODY_STEP, track.resolution)  # no pixel is stepped over
@@ -79,7 +79,7 @@ def wall_margin(track: Track, path: Path, body: Limits) -> np.ndarray:
     return np.where(inside, -track.resolution, distance)  # how deep does not matter
 
 
-def _within_the_widths(track: Track, path: Path, radius: float) -> tuple[np.ndarray, np.ndarray]:
+def _within_the_widths(track: Track, path: ClosedPath, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """The ends of the interval beside each point in which a disc is within the widths: two (n,) [m], left positive.
 
     Where there is no room, the right one is farther to the left.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,7 +42,7 @@ class FrictionMap:
             )
 
     @classmethod
-    def read(cls, path: str | FilePath, length: float) -> FrictionMap:
+    def read(cls, path: str | Path, length: float) -> FrictionMap:
         """Read a csv of `s_m, d_m, mu`, a row for every point of a grid, in any order.
 
         Raises OutlapError with the file, and what is wrong.

@@ -16,7 +16,7 @@ LEAST = 0.01  # of what a line that never turns, or never changes its speed, ask
 
 
 @dataclass(frozen=True)
-class Limits:
+class CarLimits:
     """A car as a planner sees it: a point with a friction ellipse, a motor, a steering lock and a rectangle for a body.
 
     The ellipse is (a_x / A_x)² + (a_y / A_y)² ≤ 1 with A_y = mu g across, and along the smaller of mu g and what motor
@@ -46,7 +46,7 @@ class Limits:
         return self.mu * GRAVITY
 
     @classmethod
-    def of_record(cls, record: np.ndarray) -> Limits:
+    def of_record(cls, record: np.ndarray) -> CarLimits:
         """Return the limits of a car, a record of `simulator.vehicle.PARAMETERS`."""
         p = {name: float(record[name]) for name in NAMES}
         wheelbase = p["lf"] + p["lr"]
@@ -65,7 +65,7 @@ class Limits:
         }
         return cls(**{name: float(f"{value:.6g}") for name, value in values.items()})
 
-    def implied_by(self, line: Raceline) -> Limits:
+    def implied_by(self, line: Raceline) -> CarLimits:
         """What a raceline with speeds asks of a car: its extremes of speed and acceleration, and this car's body."""
         return replace(
             self,
@@ -77,6 +77,6 @@ class Limits:
         )
 
     @classmethod
-    def of(cls, params: VehicleParams) -> Limits:
+    def of(cls, params: VehicleParams) -> CarLimits:
         """Of a car; of the middle of every range."""
         return cls.of_record(to_records(np.mean(parameter_bounds(params), axis=0)))

@@ -14,8 +14,8 @@ from scipy import ndimage
 from outlap.errors import OutlapError
 from outlap.planning.corridor import corridor
 from outlap.planning.ipopt import QUIET, ended
-from outlap.planning.limits import Limits
-from outlap.planning.path import Path, path_along, path_through
+from outlap.planning.limits import CarLimits
+from outlap.planning.path import ClosedPath, path_along, path_through
 from outlap.track.track import Track
 
 SPACING = 0.25  # [m] of the points that move
@@ -27,7 +27,7 @@ ENOUGH = 2e-3  # a smaller part of the cost is not worth another programme
 OVERSTEP = 0.02  # [m] into the margin that the stairs of the map's pixels can ask back: not from a line that is there
 
 
-def min_curvature(track: Track, limits: Limits, margin: float) -> Path:
+def min_curvature(track: Track, limits: CarLimits, margin: float) -> ClosedPath:
     """The closed line of least ∫k² ds that a car can drive without coming nearer to a wall than the margin.
 
     Args:
@@ -57,7 +57,7 @@ def min_curvature(track: Track, limits: Limits, margin: float) -> Path:
     return path
 
 
-def _least_curvature(track: Track, path: Path, right: np.ndarray, left: np.ndarray, step: float) -> np.ndarray:
+def _least_curvature(track: Track, path: ClosedPath, right: np.ndarray, left: np.ndarray, step: float) -> np.ndarray:
     """The quadratic programme: offsets (n,) [m] between right and left, none beyond what a step may be."""
     n, h = len(path.points), path.spacing
     bend = ndimage.maximum_filter1d(np.abs(path.curvature), 2 * round(1.0 / h) + 1, mode="wrap")
@@ -103,5 +103,5 @@ def _next(column: casadi.MX, step: int = 1) -> casadi.MX:
     return casadi.vertcat(column[step:], column[:step])
 
 
-def _cost(path: Path) -> float:
+def _cost(path: ClosedPath) -> float:
     return float(np.sum(path.curvature**2) * path.spacing)

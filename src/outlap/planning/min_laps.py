@@ -10,9 +10,9 @@ import numpy as np
 
 from outlap.errors import OutlapError
 from outlap.planning.corridor import wall_margin
-from outlap.planning.kept import kept, kept_line, path_arrays, path_of
-from outlap.planning.limits import Limits
-from outlap.planning.path import Path
+from outlap.planning.limits import CarLimits
+from outlap.planning.line_cache import cached, cached_line, path_arrays, path_of
+from outlap.planning.path import ClosedPath
 from outlap.planning.plan import DEFAULT_MARGIN, SPACING, plan_line
 from outlap.planning.speed_profile import lap_time, motor, speed_profiles
 from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
@@ -34,10 +34,10 @@ class MinLaps:
     optimum costs time of second order only.
     """
 
-    lines: tuple[Path, ...]
+    lines: tuple[ClosedPath, ...]
     error: float  # the largest part by which the laps of CHECKS cars were longer than on lines of their own; 0: one car
 
-    def of(self, cars: Sequence[Limits]) -> np.ndarray:
+    def of(self, cars: Sequence[CarLimits]) -> np.ndarray:
         """Of some cars: (n,) [s]."""
         motors, mu = np.array([motor(car) for car in cars]), np.array([[car.mu] for car in cars])
         times = [
@@ -54,8 +54,8 @@ def min_laps(track: Track, vehicle: VehicleParams) -> MinLaps:
 
     Raises OutlapError where no line can be planned for the middle of the ranges.
     """
-    low, high = (Limits.of_record(to_records(values)) for values in parameter_bounds(vehicle))
-    middle = Limits.of(vehicle)
+    low, high = (CarLimits.of_record(to_records(values)) for values in parameter_bounds(vehicle))
+    middle = CarLimits.of(vehicle)
 
     def to_arrays(table: MinLaps) -> dict[str, np.ndarray]:
         arrays = {"error": np.array(table.error), "count": np.array(len(table.lines))}
@@ -68,17 +68,17 @@ def min_laps(track: Track, vehicle: VehicleParams) -> MinLaps:
         return MinLaps(lines, float(saved["error"]))
 
     key = ["laps", track.fingerprint, *map(asdict, (low, middle, high)), DEFAULT_MARGIN]
-    return kept(key, lambda: _table(track, low, middle, high), to_arrays, from_arrays)
+    return cached(key, lambda: _table(track, low, middle, high), to_arrays, from_arrays)
 
 
-def _table(track: Track, low: Limits, middle: Limits, high: Limits) -> MinLaps:
-    line = kept_line(track, middle).path
+def _table(track: Track, low: CarLimits, middle: CarLimits, high: CarLimits) -> MinLaps:
+    line = cached_line(track, middle).path
     drawn = [name for name in DRAWN if getattr(low, name) < getattr(high, name)]
     if not drawn:
         return MinLaps((line,), 0.0)
     log.info("%s: planning %d more lines for the cars that are drawn", track.name, 2 * len(drawn) + CHECKS)
 
-    def car(shares: Mapping[str, float]) -> Limits:
+    def car(shares: Mapping[str, float]) -> CarLimits:
         """Of the middle, but for what is this share of the way from low to high."""
         values = {name: (1.0 - x) * getattr(low, name) + x * getattr(high, name) for name, x in shares.items()}
         return replace(middle, **values, a_brake=values.get("a_max", middle.a_brake))
@@ -89,7 +89,7 @@ def _table(track: Track, low: Limits, middle: Limits, high: Limits) -> MinLaps:
     return replace(table, error=max(0.0, float(np.max(table.of(checks) / own - 1.0))))
 
 
-def _lines_about(line: Path, track: Track, cars: Sequence[Limits]) -> list[Path]:
+def _lines_about(line: ClosedPath, track: Track, cars: Sequence[CarLimits]) -> list[ClosedPath]:
     """The minimum-time lines of cars about a line nearby, as far as they are found and free of walls."""
     from outlap.planning.min_time import MinTimeProblem, spacing_for  # CasADi: not before it is needed
 

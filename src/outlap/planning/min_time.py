@@ -22,8 +22,8 @@ from outlap.errors import OutlapError
 from outlap.planning.corridor import corridor
 from outlap.planning.friction import FrictionMap
 from outlap.planning.ipopt import QUIET, ended
-from outlap.planning.limits import Limits
-from outlap.planning.path import Path, path_from
+from outlap.planning.limits import CarLimits
+from outlap.planning.path import ClosedPath, path_from
 from outlap.planning.speed_profile import speed_profile
 from outlap.simulator.bicycle import GRAVITY
 from outlap.track.track import Track
@@ -59,7 +59,7 @@ class MinTimeProblem:
     """
 
     def __init__(
-        self, track: Track, reference: Path, body: Limits, margin: float, friction: FrictionMap | None = None
+        self, track: Track, reference: ClosedPath, body: CarLimits, margin: float, friction: FrictionMap | None = None
     ) -> None:
         self.track = track
         self.reference = reference
@@ -68,7 +68,7 @@ class MinTimeProblem:
         self._mu, self._lane = self._friction_across()
         self._solver = self._build(body)
 
-    def solve(self, limits: Limits) -> Path:
+    def solve(self, limits: CarLimits) -> ClosedPath:
         """The fastest line for a car with these limits, and the body of the problem; it begins from the reference.
 
         Raises OutlapError that names the arc length and the constraint where the solver comes to no line.
@@ -88,7 +88,7 @@ class MinTimeProblem:
             raise OutlapError(self._complaint(failure, excess, at_lock))
         return self._path(variables)
 
-    def _guess(self, limits: Limits) -> np.ndarray:
+    def _guess(self, limits: CarLimits) -> np.ndarray:
         """The reference, at its fastest speeds: (n, 6)."""
         curvature, h = self.reference.curvature, self.reference.spacing
         mu = None
@@ -103,7 +103,7 @@ class MinTimeProblem:
         ]  # fmt: skip
         return np.column_stack(columns)
 
-    def _variable_bounds(self, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+    def _variable_bounds(self, limits: CarLimits) -> tuple[np.ndarray, np.ndarray]:
         """What the variables of each point lie between: two (n, 6)."""
         slowest = min(0.9, (SLOWEST / limits.v_max) ** 2)
         low = [-np.inf, -STEEPEST, -limits.max_curvature, slowest, -limits.a_brake / GRAVITY, -np.inf]
@@ -118,14 +118,14 @@ class MinTimeProblem:
         right, left = self._right[:, None], self._left[:, None]
         return np.hstack([zeros, -free, -free, -one, right, right]), np.hstack([zeros, one, one, one, left, left])
 
-    def _path(self, state: np.ndarray) -> Path:
+    def _path(self, state: np.ndarray) -> ClosedPath:
         offset, direction, curvature = state[:, 0], state[:, 1], state[:, 2]
         driven = (1.0 - offset * self.reference.curvature) / np.cos(direction) * self.reference.spacing
         steps = 0.5 * (driven + np.roll(driven, -1))
         heading = self.reference.heading + direction
         return path_from(self.reference.shifted(offset), heading, curvature, steps, self.reference.spacing)
 
-    def _build(self, body: Limits) -> casadi.Function:
+    def _build(self, body: CarLimits) -> casadi.Function:
         n, h = len(self.reference.points), self.reference.spacing
         z, p = casadi.SX.sym("z", 6), casadi.SX.sym("p", len(PARAMETERS))
         mu, a_max, a_brake, v_max, v_switch, steer_rate_max = casadi.vertsplit(p)
@@ -211,6 +211,6 @@ def _next(rows: casadi.MX) -> casadi.MX:
     return casadi.horzcat(rows[:, 1:], rows[:, :1])
 
 
-def spacing_for(path: Path) -> float:
+def spacing_for(path: ClosedPath) -> float:
     """Of the collocation's points on a line [m]."""
     return max(SPACING, path.length / POINTS)

@@ -12,7 +12,7 @@ from outlap.track.centerline import Centerline
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class ClosedPath:
     """A closed line sampled at equal distances along it."""
 
     points: np.ndarray  # (n, 2) [m]
@@ -39,27 +39,27 @@ class Path:
         """The points moved to the left by offsets (n,) [m]: (n, 2)."""
         return self.points + offset[:, None] * self.normal
 
-    def resampled(self, spacing: float) -> Path:
+    def resampled(self, spacing: float) -> ClosedPath:
         """The same path, sampled about `spacing` [m] apart: curvature is linear in between, and so smooths nothing."""
         steps = np.full(len(self.points), self.spacing)
         return path_from(self.points, self.heading, self.curvature, steps, spacing)
 
 
-def path_along(line: Centerline, spacing: float) -> Path:
+def path_along(line: Centerline, spacing: float) -> ClosedPath:
     """A spline sampled at equal distances of about `spacing` [m]."""
     count = _count(line.length, spacing)
     s = np.arange(count) * (line.length / count)
-    return Path(line.position(s), np.unwrap(line.heading(s)), line.curvature(s), line.length)
+    return ClosedPath(line.position(s), np.unwrap(line.heading(s)), line.curvature(s), line.length)
 
 
-def path_through(points: np.ndarray, spacing: float) -> Path:
+def path_through(points: np.ndarray, spacing: float) -> ClosedPath:
     """The periodic cubic spline through points (m, 2) [m], sampled about `spacing` [m] apart, from the first on."""
     return path_along(Centerline.from_points(points, 0.0, 0.0), spacing)
 
 
 def path_from(
     points: np.ndarray, heading: np.ndarray, curvature: np.ndarray, steps: np.ndarray, spacing: float
-) -> Path:
+) -> ClosedPath:
     """A path whose headings and curvatures are known, sampled at equal distances.
 
     Args:
@@ -76,7 +76,7 @@ def path_from(
     curve = CubicHermiteSpline(s, np.vstack([points, points[:1]]), tangent)
     count = _count(s[-1], spacing)
     at = np.arange(count) * (s[-1] / count)
-    return Path(
+    return ClosedPath(
         curve(at), np.interp(at, s, heading), np.interp(at, s, np.append(curvature, curvature[0])), float(s[-1])
     )
 

@@ -13,8 +13,8 @@ import numpy as np
 from outlap.errors import OutlapError
 from outlap.planning.corridor import wall_margin
 from outlap.planning.friction import FrictionMap
-from outlap.planning.limits import Limits
-from outlap.planning.path import Path, path_along
+from outlap.planning.limits import CarLimits
+from outlap.planning.path import ClosedPath, path_along
 from outlap.planning.speed_profile import lap_time, speed_profile
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
@@ -34,10 +34,10 @@ ROUNDS = 4  # at most, in which a line is planned anew with what it lacks in mar
 class PlannedLine:
     """A line around a track for one car, and its speeds."""
 
-    path: Path
+    path: ClosedPath
     speed: np.ndarray  # (n,) [m/s]
     method: Method
-    limits: Limits
+    limits: CarLimits
     lap_time: float  # [s]
     min_margin: float  # [m] between the car's body and the nearest wall of the map, where it is least
     solve_time: float  # [s] that planning took
@@ -53,7 +53,7 @@ class PlannedLine:
 
 def plan_line(
     track: Track,
-    limits: Limits,
+    limits: CarLimits,
     method: Method = "min-time",
     margin: float = DEFAULT_MARGIN,
     friction: FrictionMap | None = None,
@@ -94,7 +94,7 @@ def plan_line(
     return planned
 
 
-def _least_curvature(track: Track, limits: Limits, margin: float) -> Path:
+def _least_curvature(track: Track, limits: CarLimits, margin: float) -> ClosedPath:
     """The line of least curvature.
 
     Between its points a line may come a little nearer to the walls: what it lacks is asked for anew, if there is room.
@@ -115,7 +115,9 @@ def _least_curvature(track: Track, limits: Limits, margin: float) -> Path:
     return path
 
 
-def _least_time(track: Track, limits: Limits, margin: float, reference: Path, friction: FrictionMap | None) -> Path:
+def _least_time(
+    track: Track, limits: CarLimits, margin: float, reference: ClosedPath, friction: FrictionMap | None
+) -> ClosedPath:
     """The line of least time, found in rounds: each about the line before, with what that lacked in margin."""
     from outlap.planning.min_time import MinTimeProblem, spacing_for
 
@@ -136,19 +138,21 @@ def _least_time(track: Track, limits: Limits, margin: float, reference: Path, fr
     return path
 
 
-def _nearest(track: Track, path: Path, limits: Limits) -> float:
+def _nearest(track: Track, path: ClosedPath, limits: CarLimits) -> float:
     """How near a car on a line comes to the walls [m]."""
     return float(wall_margin(track, path.resampled(2.0 * SPACING), limits).min())
 
 
-def _timed(track: Track, path: Path, limits: Limits, friction: FrictionMap | None) -> tuple[Path, np.ndarray, float]:
+def _timed(
+    track: Track, path: ClosedPath, limits: CarLimits, friction: FrictionMap | None
+) -> tuple[ClosedPath, np.ndarray, float]:
     """A line, its fastest speeds and its lap time."""
     mu = None if friction is None else friction.at(*track.centerline.to_frenet(*path.points.T))
     speed = speed_profile(path.curvature, path.spacing, limits, mu)
     return path, speed, lap_time(speed, path.spacing)
 
 
-def _beyond_lock(path: Path, limits: Limits) -> bool:
+def _beyond_lock(path: ClosedPath, limits: CarLimits) -> bool:
     """Whether a line turns more tightly than a car at full lock, by more than what sampling makes of a curvature."""
     return float(np.abs(path.curvature).max()) > 1.02 * limits.max_curvature
 

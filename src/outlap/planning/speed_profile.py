@@ -14,13 +14,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from outlap.planning.limits import Limits
+from outlap.planning.limits import CarLimits
 from outlap.simulator.bicycle import GRAVITY
 
 LOWEST_SPEED = 0.1  # [m/s] where a line would turn on the spot
 
 
-def speed_profile(curvature: np.ndarray, spacing: float, limits: Limits, mu: ArrayLike | None = None) -> np.ndarray:
+def speed_profile(curvature: np.ndarray, spacing: float, limits: CarLimits, mu: ArrayLike | None = None) -> np.ndarray:
     """The fastest speeds around a closed line: (n,) [m/s].
 
     Args:
@@ -33,7 +33,7 @@ def speed_profile(curvature: np.ndarray, spacing: float, limits: Limits, mu: Arr
     return speed_profiles(curvature, spacing, np.array([motor(limits)]), friction[None])[0]
 
 
-def motor(limits: Limits) -> tuple[float, float, float, float]:
+def motor(limits: CarLimits) -> tuple[float, float, float, float]:
     """A row of `motors`."""
     return limits.a_max, limits.a_brake, limits.v_max, limits.v_switch
 

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, short_repr
 
 MAX_PIXELS = 100_000_000
 
@@ -67,7 +67,7 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
         problem = getattr(error, "problem", None) or type(error).__name__
         raise OutlapError(f"{path}: is not valid yaml{where}: {' '.join(str(problem).split())}") from None
     if not isinstance(fields, Mapping):
-        raise OutlapError(f"{path}: holds {brief(fields)}; it must be a mapping with image, resolution and origin")
+        raise OutlapError(f"{path}: holds {short_repr(fields)}; it must be a mapping with image, resolution and origin")
     for field in ("image", "resolution", "origin"):
         if fields.get(field) is None:
             raise OutlapError(f"{path}: {field} is missing; a map needs image, resolution and origin")
@@ -78,10 +78,10 @@ def _read_occupancy(path: Path, fields: Mapping[str, Any]) -> np.ndarray:
     """The map image as (height, width) bool, True = wall, bottom row first."""
     mode = fields.get("mode", "trinary")
     if mode not in ("trinary", "scale"):
-        raise OutlapError(f"{path}: mode is {brief(mode)}; it must be trinary or scale")
+        raise OutlapError(f"{path}: mode is {short_repr(mode)}; it must be trinary or scale")
     negate = fields.get("negate", 0)
     if negate not in (0, 1):  # True and False are these too
-        raise OutlapError(f"{path}: negate is {brief(negate)}; it must be 0 or 1")
+        raise OutlapError(f"{path}: negate is {short_repr(negate)}; it must be 0 or 1")
     occupied = _probability(path, fields, "occupied_thresh", _OCCUPIED_THRESHOLD)
     free = _probability(path, fields, "free_thresh", min(_FREE_THRESHOLD, occupied))
     if free > occupied:
@@ -95,7 +95,7 @@ def _read_occupancy(path: Path, fields: Mapping[str, Any]) -> np.ndarray:
 
 def _image_path(yaml_path: Path, image: object) -> Path:
     if not isinstance(image, str) or not image.strip():
-        raise OutlapError(f"{yaml_path}: image is {brief(image)}; it must be the name of a file in the folder")
+        raise OutlapError(f"{yaml_path}: image is {short_repr(image)}; it must be the name of a file in the folder")
     folder = yaml_path.parent.resolve()
     try:
         path = (folder / image).resolve()
@@ -103,12 +103,12 @@ def _image_path(yaml_path: Path, image: object) -> Path:
         is_file = inside and path.is_file()
     except (OSError, ValueError, RuntimeError):
         raise OutlapError(
-            f"{yaml_path}: image is {brief(image)}; it must be the name of a file in the folder"
+            f"{yaml_path}: image is {short_repr(image)}; it must be the name of a file in the folder"
         ) from None
     if not inside:
-        raise OutlapError(f"{yaml_path}: image is {brief(image)}; it must not lead out of the folder")
+        raise OutlapError(f"{yaml_path}: image is {short_repr(image)}; it must not lead out of the folder")
     if not is_file:
-        raise OutlapError(f"{yaml_path}: image is {brief(image)}; there is no such file in the folder")
+        raise OutlapError(f"{yaml_path}: image is {short_repr(image)}; there is no such file in the folder")
     return path
 
 
@@ -162,17 +162,17 @@ def _origin(path: Path, fields: Mapping[str, Any]) -> tuple[float, float, float]
     origin = fields["origin"]
     right = "it must be [x, y, yaw] in metres and radians"
     if not isinstance(origin, list) or len(origin) != 3:
-        raise OutlapError(f"{path}: origin is {brief(origin)}; {right}")
+        raise OutlapError(f"{path}: origin is {short_repr(origin)}; {right}")
     x, y, yaw = (_to_float(value) for value in origin)
     if x is None or y is None or yaw is None:
-        raise OutlapError(f"{path}: origin is {brief(origin)}; {right}, all finite")
+        raise OutlapError(f"{path}: origin is {short_repr(origin)}; {right}, all finite")
     return x, y, yaw
 
 
 def _number(path: Path, fields: Mapping[str, Any], field: str, right: str) -> float:
     value = _to_float(fields[field])
     if value is None:
-        raise OutlapError(f"{path}: {field} is {brief(fields[field])}; it must be {right}")
+        raise OutlapError(f"{path}: {field} is {short_repr(fields[field])}; it must be {right}")
     return value
 
 
@@ -193,9 +193,3 @@ def _to_float(value: object) -> float | None:
     except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None
-
-
-def brief(value: object) -> str:
-    """`value` as an error message shows it: at most 80 characters."""
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -15,10 +15,10 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from outlap.errors import OutlapError
+from outlap.errors import OutlapError, short_repr
 from outlap.files import atomic_write
 from outlap.track.centerline import MIN_POINTS, Centerline
-from outlap.track.map_image import brief, read_map, read_text
+from outlap.track.map_image import read_map, read_text
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
 from outlap.track.walls import draw_walls
@@ -226,7 +226,7 @@ def _read_csv(path: Path, columns: tuple[str, ...], least: int = MIN_POINTS) -> 
         row = []
         for cell, number, column in zip(cells, numbers, columns, strict=True):
             if number is None or not math.isfinite(number):
-                raise OutlapError(f"{path}: line {line}: {column} is {brief(cell)}; it must be a finite number")
+                raise OutlapError(f"{path}: line {line}: {column} is {short_repr(cell)}; it must be a finite number")
             row.append(number)
         rows.append(row)
         lines.append(line)

@@ -1,4 +1,4 @@
-"""Planned lines that are kept on disk, so that each is planned once on a machine."""
+"""Planned lines in a cache on disk, so that each is planned once on a machine."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 
 from outlap.errors import brief
 from outlap.files import atomic_write
-from outlap.planning.limits import Limits
-from outlap.planning.path import Path
+from outlap.planning.limits import CarLimits
+from outlap.planning.path import ClosedPath
 from outlap.planning.plan import DEFAULT_MARGIN, Method, PlannedLine, plan_line
 from outlap.track.cache import cache_root
 from outlap.track.track import Track
@@ -26,7 +26,9 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
-def kept_line(track: Track, limits: Limits, method: Method = "min-time", margin: float = DEFAULT_MARGIN) -> PlannedLine:
+def cached_line(
+    track: Track, limits: CarLimits, method: Method = "min-time", margin: float = DEFAULT_MARGIN
+) -> PlannedLine:
     """`plan_line`, or what it found before for the same walls, centreline, limits and margin."""
 
     def plan() -> PlannedLine:
@@ -40,10 +42,10 @@ def kept_line(track: Track, limits: Limits, method: Method = "min-time", margin:
     def from_arrays(saved: Mapping[str, np.ndarray]) -> PlannedLine:
         return PlannedLine(path_of(saved), saved["speed"], method, limits, *saved["numbers"].tolist())
 
-    return kept(["line", track.fingerprint, asdict(limits), method, margin], plan, to_arrays, from_arrays)
+    return cached(["line", track.fingerprint, asdict(limits), method, margin], plan, to_arrays, from_arrays)
 
 
-def kept(
+def cached(
     key: Any,
     make: Callable[[], T],
     to_arrays: Callable[[T], Mapping[str, np.ndarray]],
@@ -77,13 +79,15 @@ def kept(
     return made
 
 
-def path_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
-    """A path as `kept` writes it."""
+def path_arrays(path: ClosedPath, prefix: str = "") -> dict[str, np.ndarray]:
+    """Return a path as `cached` writes it."""
     columns = np.column_stack([path.points, path.heading, path.curvature])
     return {f"{prefix}path": columns, f"{prefix}length": np.array(path.length)}
 
 
-def path_of(saved: Mapping[str, np.ndarray], prefix: str = "") -> Path:
+def path_of(saved: Mapping[str, np.ndarray], prefix: str = "") -> ClosedPath:
     """The inverse of `path_arrays`."""
     columns = saved[f"{prefix}path"]
-    return Path(columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy(), float(saved[f"{prefix}length"]))
+    return ClosedPath(
+        columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy(), float(saved[f"{prefix}length"])
+    )
