@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,7 +21,7 @@ class EpisodeSeeds:
         self._keys = np.random.SeedSequence().generate_state(num_envs, np.uint64)
         self._episode = np.zeros(num_envs, np.int64)  # number of each world's episode since it was seeded
 
-    def seed(self, seed: int | Sequence[int | None] | np.ndarray, which: np.ndarray) -> int | None:
+    def seed(self, seed: Any, which: np.ndarray) -> int | None:
         """Restart the streams of some worlds, (n,) numbers, and return the first world's seed.
 
         Args:
@@ -31,9 +32,9 @@ class EpisodeSeeds:
         """
         count = len(self._keys)
         if isinstance(seed, (int, np.integer)):
-            seeds: list[int | None] = [int(seed) + i for i in range(count)]
+            seeds: list[Any] = [int(seed) + i for i in range(count)]
         else:
-            seeds = list(seed) if isinstance(seed, (Sequence, np.ndarray)) else [seed]
+            seeds = [*cast("Sequence[Any]", seed)] if isinstance(seed, (Sequence, np.ndarray)) else [seed]
         for each in seeds:
             if each is not None and not (isinstance(each, (int, np.integer)) and each >= 0):
                 raise OutlapError(f"seed is {each!r}; it must be a whole number, 0 or more")

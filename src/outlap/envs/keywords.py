@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from gymnasium.vector import AutoresetMode
 
@@ -134,7 +134,7 @@ def race_parts(keywords: dict[str, Any]) -> Parts:
 
 def _listed(value: Any) -> list[Any]:
     """A list of what was given, which may be a single object."""
-    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    return [*cast("Sequence[Any]", value)] if isinstance(value, Sequence) and not isinstance(value, str) else [value]
 
 
 def _track_name(track: Any) -> str:

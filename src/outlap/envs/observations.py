@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -160,7 +160,7 @@ def check_terms(terms: Sequence[str], driver: str) -> None:
 
 def observation_space(
     terms: Sequence[str], beams: int, max_range: float, nearby_cars: int, scaled: bool
-) -> gym.spaces.Dict:
+) -> gym.spaces.Dict[Any]:
     """The space of one car's observation.
 
     Args:
@@ -170,11 +170,12 @@ def observation_space(
         nearby_cars: of which the term `nearby_cars` tells.
         scaled: whether terms are divided by their scale.
     """
-    spaces: dict[str, gym.Space] = {}
+    spaces: dict[str, gym.Space[Any]] = {}
+    counts = {"beams": beams, "nearby_cars": nearby_cars}
     for name in terms:
         term = OBSERVATION_TERMS[name]
-        blocks = {"beams": beams, "nearby_cars": nearby_cars}.get(term.blocks, term.blocks)  # type: ignore[arg-type]
-        shape = (term.size * int(blocks),)
+        blocks = term.blocks if isinstance(term.blocks, int) else counts[term.blocks]
+        shape = (term.size * blocks,)
         low, high, scale = (_repeated(ends, term.size, shape[0]) for ends in (term.low, term.high, term.scale))
         if name == "scan":
             high = np.full(shape, max_range, np.float32)
@@ -200,7 +201,7 @@ def _repeated(block: tuple[float, ...], size: int, count: int) -> np.ndarray:
 
 def observe(race: Race, car: int, terms: Sequence[str], scaled: bool) -> dict[str, np.ndarray]:
     """One car's observation in every world: new arrays (worlds, size), float32."""
-    observation = {}
+    observation: dict[str, np.ndarray] = {}
     for name in terms:
         term = OBSERVATION_TERMS[name]
         value = term.read(race, car)

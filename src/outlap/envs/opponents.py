@@ -120,7 +120,8 @@ class Opponents:
         seen = [observe(self.race, car, terms, scaled) for car in range(1, self.number.shape[1] + 1)]
         observation = {name: np.stack([each[name] for each in seen], axis=1) for name in seen[0]}
         if "scan" in observation and driver.beams is not None and driver.beams != observation["scan"].shape[2]:
-            chosen = np.rint(np.linspace(0, observation["scan"].shape[2] - 1, driver.beams)).astype(np.int64)
+            evenly: np.ndarray = np.linspace(0, observation["scan"].shape[2] - 1, driver.beams)
+            chosen = np.rint(evenly).astype(np.int64)
             observation["scan"] = observation["scan"][..., chosen]
         return observation
 
@@ -136,7 +137,7 @@ def _groups(drivers: Sequence[Driver]) -> list[tuple[np.ndarray, Driver, DriverS
     alike: dict[Hashable, list[int]] = {}
     for number, driver in enumerate(drivers):
         alike.setdefault(number if driver.architecture is None else driver.architecture, []).append(number)
-    groups = []
+    groups: list[tuple[np.ndarray, Driver, DriverStack | None]] = []
     for numbers in alike.values():
         members = [drivers[number] for number in numbers]
         first = members[0]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from pettingzoo import ParallelEnv
+from pettingzoo import ParallelEnv  # pyright: ignore[reportMissingTypeStubs]
 
 from outlap.envs.actions import check_actions
 from outlap.envs.episodes import CONTACTS
@@ -28,7 +28,7 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     wreck with `opponent_crash="park"` (the default), which stays where it is.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"name": "outlap_race_v0", "render_modes": []}
+    metadata: dict[str, Any] = {"name": "outlap_race_v0", "render_modes": []}  # noqa: RUF012  # as PettingZoo has it
 
     def __init__(self, config: RaceConfig, tracks: Sequence[Track] | None = None) -> None:
         """Build a race. `envs.keywords.make_parallel` builds it from keywords.
@@ -48,11 +48,11 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
         self.agents: list[str] = []
         self._cars = {agent: car for car, agent in enumerate(self.possible_agents)}
 
-    def observation_space(self, agent: str) -> gym.Space:
+    def observation_space(self, agent: str) -> gym.Space[Any]:
         """The same for every agent."""
         return self._env.single_observation_space
 
-    def action_space(self, agent: str) -> gym.Space:
+    def action_space(self, agent: str) -> gym.Space[Any]:
         """The same for every agent: (2,) in [-1, 1], steering and speed."""
         return self._env.single_action_space
 
@@ -118,5 +118,5 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
             "place": 1 + int((race.distance[0] > race.distance[0, car]).sum()),
             "places_gained": int(race.places_gained[0, car]),
             "places_lost": int(race.places_lost[0, car]),
-            "track": race.simulator.tracks[race.worlds.track[0]].name,
+            "track": race.simulator.tracks[int(race.worlds.track[0])].name,
         }

@@ -14,7 +14,7 @@ from outlap.simulator import state as column
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
 from outlap.simulator.collision import FREE, REMOVED
 from outlap.simulator.simulator import Simulator
-from outlap.simulator.worlds import ARC_LENGTH
+from outlap.simulator.worlds import ARC_LENGTH, Worlds
 
 EGO = 0
 RUNNING = ""  # the outcome of a race that goes on
@@ -64,7 +64,7 @@ class Race:
         self.rewards = np.zeros(everyone)
 
     @property
-    def worlds(self):
+    def worlds(self) -> Worlds:
         """The simulator's live arrays."""
         return self.simulator.worlds
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import BeforeValidator, Field, field_validator
 
@@ -21,15 +21,14 @@ PAPER_OBSERVATION = ("scan", "pose", "vel", "heading")
 
 def _vehicle_preset(value: Any) -> Any:
     """A preset's name, or a mapping with `preset` and what differs from it, as a vehicle."""
-    if isinstance(value, str):
-        value = {"preset": value}
-    if isinstance(value, dict) and "preset" in value:
-        changes = dict(value)
-        name = changes.pop("preset")
-        if not isinstance(name, str) or name not in PRESETS:
-            raise ValueError(f"preset {name!r} is unknown; there are {', '.join(PRESETS)}")
-        return {**PRESETS[name].model_dump(), **changes}
-    return value
+    fields: Any = {"preset": value} if isinstance(value, str) else value
+    if not isinstance(fields, dict) or "preset" not in fields:
+        return value
+    changes = cast("dict[str, Any]", fields).copy()
+    name = changes.pop("preset")
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ValueError(f"preset {name!r} is unknown; there are {', '.join(PRESETS)}")
+    return {**PRESETS[name].model_dump(), **changes}
 
 
 class RaceConfig(SimulatorConfig):

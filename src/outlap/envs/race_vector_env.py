@@ -46,6 +46,9 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
     episode's last observation was stands in `info["final_obs"]`, its summary in `info["final_info"]`.
     """
 
+    single_observation_space: gym.Space[Any]
+    single_action_space: gym.Space[Any]
+
     def __init__(
         self,
         num_envs: int,

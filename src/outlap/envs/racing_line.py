@@ -35,7 +35,7 @@ def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, ch
     limits = CarLimits.of_record(params)
     out = np.empty((len(atlas.line), 3), np.float32)
     for number, track in enumerate(tracks):
-        first, rows = atlas.index[number, FIRST_ROW], atlas.index[number, ROWS]
+        first, rows = int(atlas.index[number, FIRST_ROW]), int(atlas.index[number, ROWS])
         spacing, here = atlas.frame[number, SPACING], out[first : first + rows]
         if choice == "track" and track.raceline is None:
             middle = atlas.line[first : first + rows]
@@ -46,7 +46,7 @@ def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, ch
         assert line is not None
         at, _ = track.centerline.to_frenet(line.x, line.y)
         for column, values in ((LINE_X, line.x), (LINE_Y, line.y), (LINE_SPEED, line.speed)):
-            here[:, column] = np.interp(np.arange(rows) * spacing, at, values, period=track.centerline.length)
+            here[:, column] = np.interp(float(spacing) * np.arange(rows), at, values, period=track.centerline.length)
     return out
 
 
@@ -80,7 +80,7 @@ class ReferenceSpeeds:
         """Take note of worlds (n,) that begin an episode, on tracks (n,), with cars PARAMETERS (n, cars)."""
         cars = params.shape[1]
         motors = np.stack([params[name] for name in ("a_max", "a_max", "v_max", "v_switch")], axis=-1)
-        for number in np.unique(track):
+        for number in map(int, np.unique(track)):
             here = np.flatnonzero(track == number)
             line, beside = self._lines[number], self._beside[number]
             mu = params["mu"][here].reshape(-1, 1)

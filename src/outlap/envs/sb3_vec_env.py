@@ -31,7 +31,9 @@ class SB3VecEnv(VecEnv):
         self.env = env
         self.render_mode = None
         self._actions = np.zeros((env.num_envs, 2), np.float32)
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        super().__init__(  # pyright: ignore[reportUnknownMemberType]
+            env.num_envs, env.single_observation_space, env.single_action_space
+        )
 
     def reset(self) -> dict[str, np.ndarray]:
         """Begin an episode in every world, with the seeds that `seed` set."""

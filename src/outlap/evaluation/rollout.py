@@ -112,7 +112,7 @@ def evaluate(
 
     Nothing is learnt, and reward curricula are taken at their end. Returns are of the task's reward; a driver that
     observes rewards is shown those that it was trained with, whatever the task's are. An episode can be raced again
-    with `RaceEnv(tracks=[track], ...).reset(seed=...)` and its row's seed.
+    with `make_race(tracks=[track], ...).reset(seed=...)` and its row's seed.
 
     Args:
         driver: of the first car.
