@@ -15,9 +15,9 @@ from outlap.files import replacing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-BLUE, VERMILLION = "#0072B2", "#D55E00"
+BLUE, VERMILION = "#0072B2", "#D55E00"
 # In an order that keeps neighbours apart.
-COLOURS = (BLUE, VERMILLION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+COLOURS = (BLUE, VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 WALL_GREY, INK = "#BDBDBD", "#222222"
 
 WIDTH = 7.0  # [inch] of the figure: the text width of a page

@@ -16,7 +16,7 @@ from outlap.errors import OutlapError
 from outlap.track.generate import generate_track
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
-from outlap.viewer.plots import BLUE, VERMILLION, WALL_GREY, draw_raceline, draw_track
+from outlap.viewer.plots import BLUE, VERMILION, WALL_GREY, draw_raceline, draw_track
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_raceline_is_drawn_and_named_only_if_there_is_one(track):
     raceline = Raceline(s=s, x=x, y=y, heading=0 * s, curvature=0 * s, speed=5 + 0 * s, acceleration=0 * s)
 
     def drawn(figure: Figure) -> tuple[int, bool]:
-        lines = [line for line in figure.axes[0].lines if line.get_color() == VERMILLION]
+        lines = [line for line in figure.axes[0].lines if line.get_color() == VERMILION]
         return len(lines), any(text.get_text() == "racing line" for text in figure.legends[0].get_texts())
 
     assert drawn(draw_track(track)) == (0, False)

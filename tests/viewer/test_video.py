@@ -10,7 +10,7 @@ from imageio_ffmpeg import read_frames
 from PIL import Image
 
 from outlap.errors import OutlapError
-from outlap.figure_style import BLUE, COLOURS, VERMILLION
+from outlap.figure_style import BLUE, COLOURS, VERMILION
 from outlap.viewer.scene import bytes_of
 from outlap.viewer.video import count_pictures, write_video
 from recordings import circling
@@ -38,7 +38,7 @@ def test_an_mp4_has_every_picture(tmp_path: Path):
     assert len(pictures) == count_pictures(races, 20) == 60  # two seconds, and one at the end
     assert done == list(range(1, 61))
     assert near(pictures[20], BLUE) > 20
-    assert near(pictures[20], VERMILLION) > 20
+    assert near(pictures[20], VERMILION) > 20
     assert np.abs(pictures[0].astype(int) - pictures[30]).max() > 100
 
 

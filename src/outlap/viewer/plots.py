@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D, offset_copy
 
-from outlap.figure_style import BLUE, INK, VERMILLION, WALL_GREY, WIDTH, finish, new_figure
+from outlap.figure_style import BLUE, INK, VERMILION, WALL_GREY, WIDTH, finish, new_figure
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
 
@@ -89,7 +89,7 @@ def draw_raceline(
     speed_axes.set(ylabel="speed [m/s]", xlim=(0.0, length), ylim=(0.0, 1.05 * float(line.speed.max())))
     grip_axes.plot(line.s, line.acceleration, color=BLUE, linewidth=0.9, label="along")
     across = line.speed**2 * line.curvature
-    grip_axes.plot(line.s, across, color=VERMILLION, linewidth=0.9, linestyle=RACELINE_DASHES, label="across")
+    grip_axes.plot(line.s, across, color=VERMILION, linewidth=0.9, linestyle=RACELINE_DASHES, label="across")
     grip_axes.axhline(0.0, color=INK, linewidth=0.6)
     grip_axes.set(xlabel="distance along the line [m]", ylabel="acceleration\n[m/s²]", xlim=(0.0, length))
     grip_axes.legend(loc="upper right", ncols=2, fontsize=7, frameon=False)
@@ -143,7 +143,7 @@ def _draw_line(axes: Axes, track: Track) -> None:
     axes.plot(*track.centerline.position(s).T, color=BLUE, linewidth=1.0)
     if track.raceline is not None:
         x, y = track.raceline.x, track.raceline.y
-        axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=VERMILLION, linewidth=1.0, linestyle=RACELINE_DASHES)
+        axes.plot(np.append(x, x[0]), np.append(y, y[0]), color=VERMILION, linewidth=1.0, linestyle=RACELINE_DASHES)
 
 
 def _draw_marks(axes: Axes, track: Track, marks: np.ndarray) -> None:
@@ -204,7 +204,7 @@ def _legend(track: Track) -> list[Artist]:
         Patch(facecolor=WALL_GREY, label="wall"),
     ]
     if track.raceline is not None:
-        entries.append(Line2D([], [], color=VERMILLION, linewidth=1, linestyle=RACELINE_DASHES, label="racing line"))
+        entries.append(Line2D([], [], color=VERMILION, linewidth=1, linestyle=RACELINE_DASHES, label="racing line"))
     return entries
 
 
