@@ -9,6 +9,9 @@ from pathlib import Path
 import numba
 import pytest
 
+# Tests run side by side, one a core. OpenMP reads this when PyTorch loads it; child processes inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 
 @pytest.fixture(autouse=True)
 def one_thread() -> None:
