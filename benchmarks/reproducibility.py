@@ -133,7 +133,8 @@ def adaptation(folder: Path) -> str:
 
 
 def _rows(driver, folder: Path) -> str:
-    from outlap.evaluation.rollout import evaluate, standing_starts
+    from outlap.evaluation.protocol import standing_starts
+    from outlap.evaluation.rollout import evaluate
     from outlap.track import load_track
     from outlap.training.run import load_run
 

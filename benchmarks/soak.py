@@ -21,7 +21,8 @@ from typing import Any
 
 from outlap.cli.progress import progress_bar
 from outlap.envs.race_config import RaceConfig
-from outlap.evaluation.rollout import evaluate, standing_starts
+from outlap.evaluation.protocol import standing_starts
+from outlap.evaluation.rollout import evaluate
 from outlap.experiments.definitions import changed
 from outlap.experiments.engine import ONE_THREAD
 from outlap.files import atomic_write, to_json

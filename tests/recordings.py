@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from outlap.envs.frame import SPEED, YAW, Cast, X, Y
+from outlap.evaluation.frame import SPEED, YAW, Cast, X, Y
 from outlap.evaluation.recording import Event, Recording, RecordingInfo
 from outlap.track.track import Track
 

@@ -25,8 +25,6 @@ UPWARDS: set[str] = set()
 IN_CYCLES: set[str] = set()
 LONG_MODULES: set[str] = {"outlap.mql.buffers"}
 LONG_FUNCTIONS: set[str] = {
-    "outlap.cli.evaluate.evaluate_into",
-    "outlap.evaluation.rollout._race",
     "outlap.mql.adaptation.adapt",
     "outlap.mql.learner.td3_update",
     "outlap.mql.mql.__init__",

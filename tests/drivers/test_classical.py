@@ -13,7 +13,8 @@ from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.envs.observations import LINE_AHEAD
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
-from outlap.evaluation.rollout import evaluate, standing_starts
+from outlap.evaluation.protocol import standing_starts
+from outlap.evaluation.rollout import evaluate
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track import load_track
 from outlap.track.generate import BUILTIN_HELD_OUT

@@ -16,8 +16,9 @@ from outlap.envs.observations import observe
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.errors import OutlapError
-from outlap.evaluation.recording import record_lap
-from outlap.evaluation.rollout import evaluate, standing_starts
+from outlap.evaluation.protocol import standing_starts
+from outlap.evaluation.recorder import record_lap
+from outlap.evaluation.rollout import evaluate
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track.centerline import Centerline
 from outlap.track.track import Track

@@ -7,7 +7,8 @@ import pytest
 
 from outlap.drivers.population import SHIPPED, load_population, read_manifest
 from outlap.envs.race_config import RaceConfig
-from outlap.evaluation.rollout import evaluate, standing_starts
+from outlap.evaluation.protocol import standing_starts
+from outlap.evaluation.rollout import evaluate
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track import load_track
 from outlap.training.opponents import opponent_defaults, verify

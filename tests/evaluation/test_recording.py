@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from outlap.drivers.find import find_drivers
-from outlap.envs.frame import YAW, X, Y
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.errors import OutlapError
-from outlap.evaluation.recording import ARRAYS, Recording, record_episode
-from outlap.evaluation.rollout import evaluate, standing_starts
+from outlap.evaluation.frame import YAW, X, Y
+from outlap.evaluation.protocol import standing_starts
+from outlap.evaluation.recorder import record_episode
+from outlap.evaluation.recording import ARRAYS, Recording
+from outlap.evaluation.rollout import evaluate
 from outlap.simulator.vehicle import VehicleParams
 from synthetic_tracks import ring
 

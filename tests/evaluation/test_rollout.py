@@ -16,17 +16,12 @@ from outlap.drivers.function import FunctionDriver
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_env import RaceEnv
-from outlap.envs.rewards import RewardConfig
+from outlap.envs.rewards import CURRICULA_OVER, RewardConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.errors import OutlapError
 from outlap.evaluation import rollout
-from outlap.evaluation.rollout import (
-    CURRICULA_OVER,
-    drawn_parameters,
-    episode_seeds,
-    evaluate,
-    standing_starts,
-)
+from outlap.evaluation.protocol import drawn_parameters, episode_seeds, standing_starts
+from outlap.evaluation.rollout import evaluate
 from outlap.planning.plan import DEFAULT_MARGIN
 from outlap.simulator.vehicle import ActuatorParams, LidarParams, PacejkaTyre, VehicleParams, parameter_bounds
 from synthetic_tracks import ring

@@ -16,7 +16,8 @@ import pytest
 from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
-from outlap.evaluation.rollout import evaluate, standing_starts
+from outlap.evaluation.protocol import standing_starts
+from outlap.evaluation.rollout import evaluate
 from outlap.planning import min_time
 from outlap.planning.friction import FrictionMap
 from outlap.planning.limits import CarLimits

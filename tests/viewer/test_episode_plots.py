@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from outlap.envs.frame import SPEED, X, Y
 from outlap.errors import OutlapError
+from outlap.evaluation.frame import SPEED, X, Y
 from outlap.viewer.episode_plots import (
     accelerations,
     confusion,

@@ -13,10 +13,10 @@ from gymnasium.wrappers import RecordVideo
 from imageio_ffmpeg import count_frames_and_secs
 
 import outlap  # noqa: F401
-from outlap.envs.frame import Cast, Frame
 from outlap.envs.keywords import make_race
 from outlap.envs.race_env import RaceEnv
 from outlap.errors import OutlapError
+from outlap.evaluation.frame import Cast, Frame
 from outlap.figure_style import BLUE, WALL_GREY
 from outlap.simulator.collision import FREE, HIT_WALL, REMOVED
 from outlap.track.track import Track

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from outlap.drivers.find import find_drivers
-from outlap.envs.frame import Frame
 from outlap.envs.keywords import make_race
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
-from outlap.evaluation.rollout import standing_starts
+from outlap.evaluation.frame import Frame
+from outlap.evaluation.protocol import standing_starts
 from outlap.simulator.collision import HIT_WALL
 from outlap.viewer.live import LiveView
 from outlap.viewer.scene import Entry, pygame

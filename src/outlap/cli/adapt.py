@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
-from outlap.cli.races import held_out_tracks, unused
+from outlap.cli.races import unused
 from outlap.cli.recordings import with_recordings
 from outlap.cli.work import WorkCommand
 
@@ -83,6 +83,7 @@ class Adapt(WorkCommand):
         from outlap.experiments.adaptation import Races, adaptation_units, prepare_adaptations, write_adaptations
         from outlap.track.catalog import load_tracks
         from outlap.training.run import load_run
+        from outlap.training.subject import held_out_tracks
 
         self.check_flags()
         for name in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):

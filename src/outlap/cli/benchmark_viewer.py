@@ -67,7 +67,7 @@ class BenchmarkViewer(LongCommand):
 def _race(settings: BenchmarkViewer) -> tuple[Driver, RaceConfig, Track]:
     from outlap.drivers.find import find_drivers
     from outlap.envs.race_config import RaceConfig
-    from outlap.evaluation.rollout import standing_starts
+    from outlap.evaluation.protocol import standing_starts
     from outlap.track import load_track
 
     track = load_track(settings.track)
@@ -100,7 +100,7 @@ def _measure_window(settings: BenchmarkViewer) -> dict[str, Any]:
 
 
 def _measure_files(settings: BenchmarkViewer) -> dict[str, Any]:
-    from outlap.evaluation.recording import record_episode
+    from outlap.evaluation.recorder import record_episode
     from outlap.viewer.replay import write_replay
     from outlap.viewer.video import count_pictures, write_video
 

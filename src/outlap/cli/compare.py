@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from outlap.cli.arguments import check_least
 from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult
-from outlap.cli.races import find_subject, held_out_tracks, unused
+from outlap.cli.races import unused
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -53,11 +53,13 @@ class Compare(LongCommand):
     def run(self) -> CommandResult:
         import pandas as pd
 
+        from outlap.evaluation.protocol import made_for, standing_starts
         from outlap.evaluation.results import prepare_folder
-        from outlap.evaluation.rollout import evaluate, made_for, standing_starts
+        from outlap.evaluation.rollout import evaluate
         from outlap.experiments.comparison import Subject, group, write_comparison
         from outlap.provenance import provenance
         from outlap.track.catalog import load_tracks
+        from outlap.training.subject import find_subject, held_out_tracks
 
         check_least("--episodes", self.episodes, 1)
         check_least("--seed", self.seed, 0)

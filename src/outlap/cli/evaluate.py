@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,8 +15,7 @@ from outlap.cli.arguments import check_least
 from outlap.cli.command import Flag, LongCommand
 from outlap.cli.interrupts import NOTHING_KEPT
 from outlap.cli.output import CommandResult
-from outlap.cli.progress import progress_bar
-from outlap.cli.races import RaceFlags, check_positive, held_out_tracks, is_run, unused
+from outlap.cli.races import RaceFlags, Subject, check_positive, unused
 from outlap.cli.recordings import with_recordings
 from outlap.errors import OutlapError
 
@@ -30,7 +27,6 @@ if TYPE_CHECKING:
     from outlap.envs.race_config import RaceConfig
     from outlap.evaluation.rollout import EvaluationProgress
     from outlap.track import Track
-    from outlap.training.run import Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,34 +66,57 @@ class Evaluate(RaceFlags, LongCommand):
 
     def run(self) -> CommandResult:
         self._check_flags()
-        from outlap.evaluation.rollout import standing_starts
+        from outlap.evaluation.protocol import standing_starts
         from outlap.track.catalog import load_tracks
+        from outlap.training.run import is_run
+        from outlap.training.subject import held_out_tracks
 
         if self.stochastic and not is_run(self.driver):
             raise OutlapError(f"--stochastic is for a trained run; {self.driver} draws nothing")
         if self.stochastic and self.record:
             raise OutlapError("--record is of episodes that can be raced again; leave --stochastic out")
         found = self.subject(self.driver, deterministic=not self.stochastic)
-        driver, run = found.driver, found.run
         tracks = load_tracks(self.tracks or held_out_tracks(found.task))
         env = standing_starts(found.env, tracks, self.laps, self.time_limit)
-        home = run.folder if run else Path("runs") / driver.name
+        home = found.run.folder if found.run else Path("runs") / found.driver.name
         folder = self.out or unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
-        result = evaluate_into(
-            folder,
-            driver,
-            env,
-            tracks,
-            episodes=self.episodes,
-            seed=self.seed,
-            num_worlds=self.worlds,
-            run=run,
-            facts={"stochastic": self.stochastic},
-            quiet=self.quiet,
-        )
+        data = self._evaluate(found, env, tracks, folder)
+        result = CommandResult(data, lambda console: show_summary(console, data))
         if not self.record:
             return result
-        from outlap.evaluation.recording import RECORDINGS, record_episodes
+        self._record(found.driver, env, tracks, folder)
+        return with_recordings(result, folder, tracks[0])
+
+    def _evaluate(self, found: Subject, env: RaceConfig, tracks: Sequence[Track], folder: Path) -> Mapping[str, Any]:
+        from outlap.evaluation.evaluate import evaluate_into
+
+        run, begun = found.run, time.monotonic()
+        with self.progress("evaluating", self.episodes * len(tracks), "episodes") as update:
+
+            def show(progress: EvaluationProgress) -> None:
+                rate = progress.steps / max(time.monotonic() - begun, 1e-9)
+                update(int(progress.done), f"{progress.finished} finished  {rate:,.0f} steps/s")
+
+            try:
+                return evaluate_into(
+                    folder,
+                    found.driver,
+                    env,
+                    tracks,
+                    episodes=self.episodes,
+                    seed=self.seed,
+                    num_worlds=self.worlds,
+                    trained_on=run.trained_on([track.name for track in tracks]) if run else (),
+                    facts={**(run.policy_record() if run else {}), "stochastic": self.stochastic},
+                    on_progress=show,
+                )
+            except KeyboardInterrupt:
+                print(f"\n{NOTHING_KEPT}", file=sys.stderr)
+                raise
+
+    def _record(self, driver: Driver, env: RaceConfig, tracks: Sequence[Track], folder: Path) -> None:
+        from outlap.evaluation.recorder import record_episodes
+        from outlap.evaluation.recording import RECORDINGS
 
         number = min(self.record, self.episodes)
         with self.progress("recording", number * len(tracks), "episodes") as update:
@@ -109,7 +128,6 @@ class Evaluate(RaceFlags, LongCommand):
 
             for track in tracks:
                 record_episodes(driver, env, track, self.seed, number, folder / RECORDINGS, on_recorded=recorded)
-        return with_recordings(result, folder, tracks[0])
 
     def _check_flags(self) -> None:
         self.check_races()
@@ -123,76 +141,6 @@ class Evaluate(RaceFlags, LongCommand):
         check_positive("--time-limit", self.time_limit)
         if self.laps == 0 and self.time_limit is None:
             raise OutlapError("--laps is 0; must be 1 or more, or be given with a --time-limit")
-
-
-def evaluate_into(
-    folder: Path,
-    driver: Driver,
-    env: RaceConfig,
-    tracks: Sequence[Track],
-    *,
-    episodes: int,
-    seed: int,
-    num_worlds: int,
-    run: Run | None = None,
-    facts: Mapping[str, Any] | None = None,
-    quiet: bool = False,
-) -> CommandResult:
-    """Evaluate with a progress bar and leave rows, summary and record in a folder.
-
-    Args:
-        folder: new or empty; removed again if the evaluation does not come to its end.
-        driver: to evaluate.
-        env: the task, see `rollout.standing_starts`.
-        tracks: to evaluate on.
-        episodes: on each track.
-        seed, num_worlds: see `rollout.evaluate`.
-        run: of the driver, if it has one: tracks that it was trained on are named as such.
-        facts: more for the record.
-        quiet: show no progress.
-
-    Raises OutlapError for a folder that is not empty or cannot be written, and what `evaluate` raises.
-    """
-    from outlap.evaluation.metrics import summarise
-    from outlap.evaluation.results import prepare_folder, save_results
-    from outlap.evaluation.rollout import evaluate
-    from outlap.provenance import provenance
-
-    prepare_folder(folder)
-    begun = time.monotonic()
-    try:
-        with progress_bar("evaluating", episodes * len(tracks), "episodes", quiet) as update:
-
-            def show(progress: EvaluationProgress) -> None:
-                rate = progress.steps / max(time.monotonic() - begun, 1e-9)
-                update(int(progress.done), f"{progress.finished} finished  {rate:,.0f} steps/s")
-
-            rows = evaluate(driver, env, tracks, episodes, seed, num_worlds, show)
-    except BaseException as error:
-        with suppress(OSError):
-            folder.rmdir()  # it is empty
-        if isinstance(error, KeyboardInterrupt):
-            print(f"\n{NOTHING_KEPT}", file=sys.stderr)
-        raise
-    names = [track.name for track in tracks]
-    trained_on = _trained_on(run, names)
-    summary = {**summarise(rows), "trained_on": trained_on}
-    record = {
-        **provenance(),
-        "seconds": round(time.monotonic() - begun, 1),
-        "driver": driver.name,
-        **_policy_record(run),
-        "tracks": {track.name: track.fingerprint for track in tracks},
-        "trained_on": trained_on,
-        "episodes_per_track": episodes,
-        "seed": seed,
-        "worlds": num_worlds,
-        **(facts or {}),
-        "env": env.model_dump(mode="json"),
-    }
-    save_results(folder, rows, summary, record)
-    data = {**summary, "driver": driver.name, "folder": folder}
-    return CommandResult(data, lambda console: show_summary(console, data))
 
 
 def show_summary(console: Console, data: Mapping[str, Any]) -> None:
@@ -277,25 +225,3 @@ def _cell(summary: Mapping[str, Any], column: str) -> str:
         f"{value['mean']:.{digits}f} ± {value['sd']:.{digits}f}\n"
         f"[{value['low']:.{digits}f}, {value['high']:.{digits}f}]"
     )
-
-
-def _trained_on(run: Run | None, tracks: Sequence[str]) -> list[str]:
-    """Those of the tracks that the run was trained on."""
-    from outlap.track.catalog import name_key
-    from outlap.track.generate import BUILTIN_TRAIN
-
-    if run is None:
-        return []
-    trained = {name_key(Path(name).name) for name in run.config.env.tracks or BUILTIN_TRAIN}
-    return [name for name in tracks if name_key(name) in trained]
-
-
-def _policy_record(run: Run | None) -> dict[str, Any]:
-    if run is None:
-        return {}
-    path = run.policy_path
-    return {
-        "run": run.folder.resolve(),
-        "policy": path.relative_to(run.folder),
-        "policy_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-    }

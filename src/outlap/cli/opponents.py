@@ -94,10 +94,11 @@ class RecordLap(Command):
     """Of the start."""
 
     def run(self) -> CommandResult:
-        from outlap.cli.races import find_subject, with_top_speed
         from outlap.drivers.ghost import Ghost
-        from outlap.evaluation.recording import record_lap
+        from outlap.evaluation.protocol import with_top_speed
+        from outlap.evaluation.recorder import record_lap
         from outlap.track import load_track
+        from outlap.training.subject import find_subject
 
         if self.out.suffix != ".csv":
             raise OutlapError(f"--out is {self.out}; must end in .csv, by which a recorded lap is known")

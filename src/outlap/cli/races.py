@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from outlap.cli.arguments import check_least
 from outlap.cli.command import Flag
-from outlap.drivers.find import find_drivers
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -57,8 +56,9 @@ class RaceFlags:
 
     def subject(self, name: str, *, deterministic: bool = True) -> Subject:
         """A driver, and what it is to race in. Raises what `find_subject` does."""
-        from outlap.evaluation.rollout import made_for
+        from outlap.evaluation.protocol import made_for, with_top_speed
         from outlap.training.run import load_run
+        from outlap.training.subject import find_subject
 
         driver, env, run = find_subject(name, deterministic=deterministic, seed=self.seed)
         task = run
@@ -97,50 +97,6 @@ def check_positive(flag: str, value: float | None) -> None:
     """Raises OutlapError for a number that is given, and not above 0 and finite."""
     if value is not None and not 0.0 < value < float("inf"):
         raise OutlapError(f"{flag} is {value}; must be > 0")
-
-
-def is_run(name: str) -> bool:
-    """Whether a driver's name is that of a run folder."""
-    return (Path(name) / "config.yaml").is_file()
-
-
-def find_subject(name: str, *, deterministic: bool = True, seed: int = 0) -> tuple[Driver, RaceConfig, Run | None]:
-    """The one driver that a name stands for, the environment that it is made for, and its run if it has one.
-
-    Args:
-        name: a run folder, or what `drivers.find` knows.
-        deterministic, seed: see `PolicyDriver`; of a run's policy.
-
-    Raises OutlapError for a name that stands for nobody, or for many.
-    """
-    from outlap.evaluation.rollout import made_for
-    from outlap.training.ppo import PPOConfig
-    from outlap.training.run import load_run
-
-    if is_run(name):
-        run = load_run(name)
-        return run.driver(deterministic=deterministic, seed=seed), run.config.env, run
-    env = PPOConfig().env
-    drivers = find_drivers([name], env.field_of_view, split=None, run_code=True)
-    if len(drivers) > 1:
-        names = ", ".join(driver.name for driver in drivers)
-        raise OutlapError(f"{name}: is a population; name one of its drivers, {name}/NAME: {names}")
-    return drivers[0], made_for(drivers[0], env), None
-
-
-def held_out_tracks(run: Run | None) -> tuple[str, ...]:
-    """Names of the tracks that a run has kept from its training, or else the built-in ones."""
-    from outlap.track.generate import BUILTIN_HELD_OUT
-
-    return (run.config.held_out_tracks if run else ()) or BUILTIN_HELD_OUT
-
-
-def with_top_speed(env: RaceConfig, v_max: float | None) -> RaceConfig:
-    """The task with another top speed of the cars; actions go on to mean the speeds that they were trained with."""
-    if v_max is None:
-        return env
-    vehicle = env.vehicle.model_copy(update={"v_max": v_max})
-    return env.model_copy(update={"vehicle": vehicle, "speed_range": env.commanded_speeds})
 
 
 def unused(folder: Path) -> Path:

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from outlap.cli.arguments import check_least
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import progress_bar
-from outlap.cli.races import RaceFlags, check_positive, held_out_tracks, is_run
+from outlap.cli.races import RaceFlags, check_positive
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -59,8 +59,9 @@ class EpisodeFlags(RaceFlags):
 
         Raises OutlapError for names of nothing, and for recordings of several tracks.
         """
-        from outlap.evaluation.recording import Recording, record_episode
-        from outlap.evaluation.rollout import episode_seeds, standing_starts
+        from outlap.evaluation.protocol import episode_seeds, standing_starts
+        from outlap.evaluation.recorder import record_episode
+        from outlap.evaluation.recording import Recording
         from outlap.track import load_track
 
         self.check_races()
@@ -110,7 +111,11 @@ def _track_name(recorded: Sequence[Recording], tasks: Sequence[Run | None]) -> s
         raise OutlapError(f"recordings of {names[0]}: give its map folder as --track")
     if len(names) > 1:
         raise OutlapError(f"recordings of several tracks: {', '.join(names)}; say which one with --track")
-    return names[0] if names else held_out_tracks(tasks[0])[0]
+    if names:
+        return names[0]
+    from outlap.training.subject import held_out_tracks
+
+    return held_out_tracks(tasks[0])[0]
 
 
 def _raced_on(track: Track, name: str, recordings: Mapping[Path, Recording]) -> list[Recording]:
@@ -131,6 +136,7 @@ def recording_files(name: str) -> list[Path]:
     Raises OutlapError for a folder without any that is no run either.
     """
     from outlap.evaluation.recording import RECORDINGS, SUFFIX
+    from outlap.training.run import is_run
 
     path = Path(name)
     if path.suffix == SUFFIX:

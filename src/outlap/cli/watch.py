@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from outlap.cli.arguments import check_least
 from outlap.cli.command import Command
 from outlap.cli.output import CommandResult
-from outlap.cli.races import RaceFlags, check_positive, held_out_tracks
+from outlap.cli.races import RaceFlags, check_positive
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +39,9 @@ class WatchRaces(RaceFlags, Command):
     """Of the window, width and height in pixels."""
 
     def run(self) -> CommandResult:
-        from outlap.evaluation.rollout import standing_starts
+        from outlap.evaluation.protocol import standing_starts
         from outlap.track import load_track
+        from outlap.training.subject import held_out_tracks
         from outlap.viewer.watch import Watch
 
         self.check_races()

@@ -1,14 +1,13 @@
-"""Racing a driver in a fixed set of episodes: from a driver and tracks to rows, one an episode.
+"""Race a driver in a fixed set of episodes: one row for each episode.
 
-Which episodes are raced is settled before the first step: so many on each track, each with its own seed, and
-each is raced to its end. How many worlds race at once changes nothing but the time that it takes. To stop at
-a number of steps, or to take the first N episodes that end, would favour short ones, which are crashes.
+The episodes are chosen before the first step: a number of them on each track, each with its own seed, and each is
+raced to its end. The number of worlds that race at once changes nothing but the time that it takes. To stop at a number
+of steps, or to take the first N episodes that end, would favour short ones, which are crashes.
 """
 
 from __future__ import annotations
 
 import logging
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,25 +17,23 @@ import pandas as pd
 from gymnasium.vector import AutoresetMode
 
 from outlap.drivers.driver import Driver
-from outlap.drivers.find import find_drivers
 from outlap.envs.actions import driver_actions
-from outlap.envs.observations import check_terms
 from outlap.envs.race import EGO, Race
-from outlap.envs.race_config import RaceConfig, StartConfig
+from outlap.envs.race_config import RaceConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import CURRICULA_OVER, RewardConfig, weighted_terms
-from outlap.envs.terminations import CRASH, TerminationConfig
+from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
+from outlap.evaluation.protocol import drawn_parameters, episode_seeds, episode_task
 from outlap.planning.limits import CarLimits
 from outlap.planning.min_laps import min_laps
-from outlap.simulator.vehicle import parameter_bounds, parameter_names, to_records
+from outlap.simulator.vehicle import to_records
 from outlap.track.catalog import load_tracks
 from outlap.track.track import Track
 
 log = logging.getLogger(__name__)
 
 DEFAULT_WORLDS = 128
-CRAWL = 1.0  # [m/s] mean speed at which the default time limit still allows all laps and the way to the line
 VEHICLE = "vehicle"  # in a row while its episode is raced: the ego's parameters
 IDLE = -1  # the episode of a world that has none left
 
@@ -49,53 +46,6 @@ class EvaluationProgress:
     finished: int
     done: float  # episodes, a running one counted by the share of its laps or time that is behind it
     steps: int  # actions taken
-
-
-def standing_starts(
-    env: RaceConfig, tracks: Sequence[Track], laps: int = 3, time_limit: float | None = None
-) -> RaceConfig:
-    """A task as it is evaluated: from a standstill anywhere on the lap, until the laps are done.
-
-    Cars, sensors, actions and rewards stay those of `env`; where cars are put and how an episode ends do not,
-    so that policies are compared on the same episodes however they were trained.
-
-    Args:
-        env: what the policy was trained on.
-        tracks: to evaluate on.
-        laps: to complete from line to line; 0 for no end but the time limit.
-        time_limit: [s]; by default enough for `laps` + 1 laps of the longest track at 1 m/s.
-
-    Raises OutlapError for neither laps nor a time limit.
-    """
-    if time_limit is None:
-        if laps == 0:
-            raise OutlapError("laps is 0; a time limit is needed then")
-        time_limit = (laps + 1) * max(track.centerline.length for track in tracks) / CRAWL
-    changes = {
-        "tracks": tuple(track.name for track in tracks),
-        "augment_tracks": False,
-        "start": StartConfig(anywhere=True, speed=0.0, gap=env.start.gap, formation=env.start.formation),
-        "termination": TerminationConfig(laps=laps, time_limit=time_limit),
-    }
-    return env.model_copy(update=changes)
-
-
-def made_for(driver: Driver, env: RaceConfig) -> RaceConfig:
-    """A task with the scanner and the car that a driver was trained with, as far as it says so."""
-    changes: dict[str, Any] = {}
-    if driver.beams is not None:
-        changes["beams"] = driver.beams
-    if driver.speeds is not None:
-        vehicle = env.vehicle.model_copy(update={"v_max": driver.speeds[1]})
-        changes |= {"vehicle": vehicle, "speed_range": driver.speeds}
-    return env.model_copy(update=changes)
-
-
-def episode_seeds(seed: int, track: str, episodes: int) -> np.ndarray:
-    """The seeds of a track's episodes: int64 (episodes,), the first ones the same however many there are."""
-    key = zlib.crc32(track.encode())
-    words = [np.random.SeedSequence((seed, key, k)).generate_state(1)[0] for k in range(episodes)]
-    return np.array(words, np.int64)
 
 
 def evaluate(
@@ -152,9 +102,10 @@ def evaluate(
             on_progress(EvaluationProgress(total, before + finished, before + done, steps + track_steps))
 
     for track in loaded:
-        found, track_steps = _race(driver, env_config, track, seeds[track.name], num_worlds, watch)
+        races = _Races(driver, env_config, track, seeds[track.name], num_worlds)
+        found = races.run(watch)
         rows += _with_lap_time_ratios(found, track, env_config, lap_time_ratios)
-        steps += track_steps
+        steps += races.steps
     return pd.DataFrame(rows)
 
 
@@ -173,67 +124,82 @@ def _check_arguments(config: RaceConfig, tracks: Sequence[Track], episodes: int,
         raise OutlapError("termination: an episode may never end; set a time_limit, or laps and a stall_time")
 
 
-def _race(
-    driver: Driver,
-    config: RaceConfig,
-    track: Track,
-    seeds: np.ndarray,
-    num_worlds: int,
-    watch: Callable[[int, float, int], None],
-) -> tuple[list[dict[str, Any]], int]:
-    """Every episode of one track: its rows, and the steps that they took."""
-    worlds = min(num_worlds, len(seeds))
-    task, opponents = episode_task(driver, config)
-    env = RaceVectorEnv(worlds, task, [track], opponents, autoreset_mode=AutoresetMode.DISABLED)
-    score = _Score(config.reward, task.reward, worlds)
-    driver.check(env.single_observation_space)
-    drawn = drawn_parameters(config)
-    drawn_speeds = range(1, config.num_cars if isinstance(config.opponent_speed, tuple) else 1)
-    length = track.centerline.length
-    rows: dict[int, dict[str, Any]] = {}
-    racing = np.arange(worlds)  # the episode of each world
-    upcoming = worlds
-    observation, _ = env.reset(seed=seeds[:worlds].tolist())
-    driver.begin(np.ones(worlds, bool))
-    start = env.race.start[:, EGO].copy()
-    steps = 0
-    while len(rows) < len(seeds):
-        env.training_steps = CURRICULA_OVER
-        observation, rewards, terminated, truncated, info = env.step(driver_actions(driver, observation, worlds))
-        steps += int((racing != IDLE).sum())
-        over = terminated | truncated
-        last, returns = score.step(env.race, rewards, info)
-        for world in np.flatnonzero(over & (racing != IDLE)).tolist():
-            episode = int(racing[world])
-            rows[episode] = {
-                "track": track.name,
-                "episode": episode,
-                "seed": int(seeds[episode]),
-                "driver": driver.name,
-                **_row(info, world),
-                "terminated": bool(terminated[world]),
-                "truncated": bool(truncated[world]),
-                "episode_return": float(returns[world]),
-                "last_reward": float(last[world]),
-                "start_m": float(start[world] % length),
-                **{name: float(info["vehicle"][world, EGO, column]) for name, column in drawn.items()},
-                **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in range(1, config.num_cars)},
-                **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in drawn_speeds},
-                VEHICLE: info["vehicle"][world, EGO].copy(),
-            }
-        if over.any():
-            again: list[int | None] = [None] * worlds  # an idle world goes on with a stream of its own
-            for world in np.flatnonzero(over):
-                racing[world] = upcoming if upcoming < len(seeds) else IDLE
-                if racing[world] != IDLE:
-                    again[world] = int(seeds[upcoming])
-                    upcoming += 1
-            observation, info = env.reset(seed=again, options={"reset_mask": over})
-            driver.begin(over)
-            score.begin(over)
-            start[over] = env.race.start[over, EGO]
-        watch(len(rows), len(rows) + _underway(config, length, start, info, racing != IDLE), steps)
-    return [rows[episode] for episode in range(len(seeds))], steps
+class _Races:
+    """All episodes of one track; a world whose episode has ended starts the next one."""
+
+    def __init__(self, driver: Driver, config: RaceConfig, track: Track, seeds: np.ndarray, num_worlds: int) -> None:
+        self.driver, self.config, self.track, self.seeds = driver, config, track, seeds
+        worlds = min(num_worlds, len(seeds))
+        task, opponents = episode_task(driver, config)
+        self.env = RaceVectorEnv(worlds, task, [track], opponents, autoreset_mode=AutoresetMode.DISABLED)
+        driver.check(self.env.single_observation_space)
+        self.score = _Score(config.reward, task.reward, worlds)
+        self.drawn = drawn_parameters(config)
+        self.episode = np.arange(worlds)  # of each world
+        self.upcoming = worlds  # the next episode
+        self.start = np.zeros(worlds)  # arc length [m]
+        self.rows: dict[int, dict[str, Any]] = {}  # by episode
+        self.steps = 0
+
+    def run(self, watch: Callable[[int, float, int], None]) -> list[dict[str, Any]]:
+        """Race all episodes and return their rows; call `watch` after every step with what is done, see `evaluate`."""
+        env, driver = self.env, self.driver
+        worlds = len(self.episode)
+        observation, _ = env.reset(seed=self.seeds[:worlds].tolist())
+        driver.begin(np.ones(worlds, bool))
+        self.start[:] = env.race.start[:, EGO]
+        while len(self.rows) < len(self.seeds):
+            env.training_steps = CURRICULA_OVER
+            observation, rewards, terminated, truncated, info = env.step(driver_actions(driver, observation, worlds))
+            self.steps += int((self.episode != IDLE).sum())
+            over = terminated | truncated
+            last, returns = self.score.step(env.race, rewards, info)
+            for world in np.flatnonzero(over & (self.episode != IDLE)).tolist():
+                end = {
+                    "terminated": bool(terminated[world]),
+                    "truncated": bool(truncated[world]),
+                    "episode_return": float(returns[world]),
+                    "last_reward": float(last[world]),
+                }
+                self.rows[int(self.episode[world])] = self._row(world, info, end)
+            if over.any():
+                observation, info = self._begin(over)
+            underway = _underway(self.config, self.track.centerline.length, self.start, info, self.episode != IDLE)
+            watch(len(self.rows), len(self.rows) + underway, self.steps)
+        return [self.rows[episode] for episode in range(len(self.seeds))]
+
+    def _begin(self, worlds: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin the next episodes in some worlds, bool (worlds,); return the observation and the info."""
+        seeds: list[int | None] = [None] * len(worlds)  # an idle world draws from a stream of its own
+        for world in np.flatnonzero(worlds):
+            self.episode[world] = self.upcoming if self.upcoming < len(self.seeds) else IDLE
+            if self.episode[world] != IDLE:
+                seeds[world] = int(self.seeds[self.upcoming])
+                self.upcoming += 1
+        observation, info = self.env.reset(seed=seeds, options={"reset_mask": worlds})
+        self.driver.begin(worlds)
+        self.score.begin(worlds)
+        self.start[worlds] = self.env.race.start[worlds, EGO]
+        return observation, info
+
+    def _row(self, world: int, info: dict[str, Any], end: dict[str, Any]) -> dict[str, Any]:
+        """The row of a world's episode, which has just ended, with the values of its last step."""
+        episode, vehicle = int(self.episode[world]), info["vehicle"][world, EGO].copy()
+        opponents = range(1, self.config.num_cars)
+        drawn_speeds = opponents if isinstance(self.config.opponent_speed, tuple) else ()
+        return {
+            "track": self.track.name,
+            "episode": episode,
+            "seed": int(self.seeds[episode]),
+            "driver": self.driver.name,
+            **_row(info, world),
+            **end,
+            "start_m": float(self.start[world] % self.track.centerline.length),
+            **{name: float(vehicle[column]) for name, column in self.drawn.items()},
+            **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in opponents},
+            **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in drawn_speeds},
+            VEHICLE: vehicle,
+        }
 
 
 def _with_lap_time_ratios(
@@ -256,40 +222,6 @@ def _with_lap_time_ratios(
     for row, seconds, part in zip(rows, least.tolist(), error.tolist(), strict=True):
         row |= {"min_lap_time_s": seconds, "lap_time_ratio": row["lap_time_s"] / seconds, "min_lap_error": part}
     return rows
-
-
-def episode_task(driver: Driver, config: RaceConfig) -> tuple[RaceConfig, list[Driver]]:
-    """Return a task as this driver needs it, on one track, and its opponents.
-
-    Raises OutlapError for an observation term that does not exist, and for opponents that cannot be loaded.
-    """
-    check_terms(driver.observation_terms, driver.name)
-    opponents: list[Driver] = []
-    if config.num_cars > 1:
-        opponents = find_drivers(config.opponents, config.field_of_view, config.opponent_split, config.opponent_code)
-    shown = driver.reward or config.reward
-    assert isinstance(shown, RewardConfig)
-    changes: dict[str, Any] = {
-        "augment_tracks": False,  # the track that was named, not one of its variants
-        "observation": tuple(driver.observation_terms),
-        "scale_observations": driver.scale_observations,
-        "reward": shown.without_curricula(),
-    }
-    if not any("scan" in each.observation_terms for each in (driver, *opponents)):
-        changes["beams"] = 0  # nobody looks
-    return config.model_copy(update=changes), opponents
-
-
-def single_race(driver: Driver, config: RaceConfig, track: Track) -> RaceVectorEnv:
-    """One world as `evaluate` has it for a driver, with the task's scanner even where nobody looks: for pictures.
-
-    Raises OutlapError for a task that the driver does not take.
-    """
-    task, opponents = episode_task(driver, config)
-    task = task.model_copy(update={"beams": config.beams})
-    env = RaceVectorEnv(1, task, [track], opponents, autoreset_mode=AutoresetMode.DISABLED)
-    driver.check(env.single_observation_space)
-    return env
 
 
 class _Score:
@@ -342,9 +274,3 @@ def _underway(config: RaceConfig, length: float, start: np.ndarray, info: dict[s
         to_line = length - start % length
         share = np.maximum(share, info["progress_m"] / (to_line + rules.laps * length))
     return float(np.clip(share[racing], 0.0, 0.999).sum())
-
-
-def drawn_parameters(config: RaceConfig) -> dict[str, int]:
-    """Those of a car's parameters that are ranges: the name of each in a row, and its `vehicle` column."""
-    low, high = parameter_bounds(config.vehicle, config.actuators, config.lidar)
-    return {name: column for column, name in enumerate(parameter_names()) if low[column] < high[column]}

@@ -16,7 +16,8 @@ import pandas as pd
 from outlap.envs.race_config import RaceConfig
 from outlap.evaluation import rollout
 from outlap.evaluation.metrics import summarise_methods
-from outlap.evaluation.recording import RECORDINGS, record_episodes
+from outlap.evaluation.recorder import record_episodes
+from outlap.evaluation.recording import RECORDINGS
 from outlap.evaluation.results import ROWS, UPDATES, prepare_folder, save_results, write_rows
 from outlap.experiments.paper_units import adaptation_settings, collecting_env
 from outlap.experiments.unit import Report, Unit

@@ -135,7 +135,8 @@ class RaceUnit(Unit):
         return len(self.tasks) * self.episodes * self.time_limit
 
     def do(self, work: Path, report: Report) -> None:
-        from outlap.evaluation.rollout import EvaluationProgress, evaluate, standing_starts
+        from outlap.evaluation.protocol import standing_starts
+        from outlap.evaluation.rollout import EvaluationProgress, evaluate
         from outlap.track.catalog import load_track
 
         meta = load_meta(self.training.run(work)) if self.adaptation is not None and self.training else None

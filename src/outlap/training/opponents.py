@@ -15,7 +15,8 @@ from outlap.drivers.population import MANIFEST, Member, Split, file_hashes, read
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import CRASH
-from outlap.evaluation.rollout import evaluate, made_for, standing_starts
+from outlap.evaluation.protocol import made_for, standing_starts
+from outlap.evaluation.rollout import evaluate
 from outlap.track.track import Track
 from outlap.training.model_file import load_model
 from outlap.training.ppo import PPOConfig

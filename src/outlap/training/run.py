@@ -10,12 +10,13 @@ tensorboard/
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,8 @@ from outlap.config import read_yaml, save_config, validate
 from outlap.errors import OutlapError
 from outlap.files import atomic_write, to_json
 from outlap.provenance import provenance
+from outlap.track.catalog import name_key
+from outlap.track.generate import BUILTIN_TRAIN
 from outlap.training.algorithms import ALGORITHMS
 from outlap.training.config import TrainingConfig
 from outlap.training.device import check_device
@@ -81,6 +84,20 @@ class Run:
             reward=env.reward,
         )
 
+    def policy_record(self) -> dict[str, Any]:
+        """Return which policy a result is of: the run, the file and its SHA-256."""
+        path = self.policy_path
+        return {
+            "run": self.folder.resolve(),
+            "policy": path.relative_to(self.folder),
+            "policy_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        }
+
+    def trained_on(self, tracks: Sequence[str]) -> list[str]:
+        """Return the names of tracks that the run was trained on, of those given."""
+        trained = {name_key(Path(name).name) for name in self.config.env.tracks or BUILTIN_TRAIN}
+        return [name for name in tracks if name_key(name) in trained]
+
     def checkpoints(self) -> list[Path]:
         """Checkpoints, newest first."""
         return sorted(self._of_checkpoints(".zip"), key=_steps_of, reverse=True)
@@ -132,10 +149,15 @@ def create_run(folder: Path, config: TrainingConfig) -> Run:
     return run
 
 
+def is_run(folder: str | os.PathLike[str]) -> bool:
+    """Return whether a folder holds a run."""
+    return (Path(folder) / "config.yaml").is_file()
+
+
 def load_run(folder: str | os.PathLike[str]) -> Run:
     """A run folder made by `outlap train`. Raises OutlapError where it is missing or broken."""
     folder = Path(folder)
-    if not (folder / "config.yaml").is_file():
+    if not is_run(folder):
         raise OutlapError(f"{folder}: is not a run folder, it has no config.yaml; make one with outlap train")
     path = folder / "config.yaml"
     content = read_yaml(path)

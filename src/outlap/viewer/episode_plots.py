@@ -13,9 +13,9 @@ from matplotlib.patches import Circle
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from outlap.envs.frame import SLIP, SPEED, YAW
 from outlap.envs.race import EGO
 from outlap.errors import OutlapError
+from outlap.evaluation.frame import SLIP, SPEED, YAW
 from outlap.evaluation.recording import Recording, check_together
 from outlap.evaluation.statistics import estimate_mean
 from outlap.figure_style import COLOURS, INK, WIDTH, finish, new_figure

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from outlap.envs.frame import Frame, cast_of, frame_of
 from outlap.envs.race import EGO
 from outlap.envs.race_vector_env import RaceVectorEnv
+from outlap.evaluation.frame import Frame, cast_of, frame_of
 from outlap.track.track import Track
 from outlap.viewer.scene import Entry, Scene, Trail, pygame
 from outlap.viewer.window import FRAMES_PER_SECOND, Window

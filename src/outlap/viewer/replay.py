@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from outlap.envs.frame import NO_ECHO, YAW
+from outlap.evaluation.frame import NO_ECHO, YAW
 from outlap.evaluation.recording import Recording, check_together
 from outlap.figure_style import COLOURS, WALL_GREY
 from outlap.files import atomic_write

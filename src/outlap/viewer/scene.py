@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from outlap.envs.frame import SPEED, STEER, YAW, Cast, Frame, X, Y
 from outlap.envs.race import EGO
 from outlap.errors import OutlapError
+from outlap.evaluation.frame import SPEED, STEER, YAW, Cast, Frame, X, Y
 from outlap.figure_style import COLOURS, INK, WALL_GREY
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, REMOVED
 from outlap.track.track import Track

@@ -8,12 +8,12 @@ import numpy as np
 
 from outlap.drivers.driver import Driver
 from outlap.envs.actions import driver_actions
-from outlap.envs.frame import Frame, between, cast_of, frame_of
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import CURRICULA_OVER
-from outlap.evaluation.recording import how_it_ended
-from outlap.evaluation.rollout import single_race
+from outlap.evaluation.frame import Frame, between, cast_of, frame_of
+from outlap.evaluation.protocol import single_race
+from outlap.evaluation.recorder import how_it_ended
 from outlap.track.track import Track
 from outlap.viewer.scene import Entry, Trail, pygame
 from outlap.viewer.window import FRAMES_PER_SECOND, LOOKING, Window, key_of
