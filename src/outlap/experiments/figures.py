@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -53,7 +55,7 @@ def draw_intervals(
     heights = range(len(cells) - 1, -1, -1)
     published = False
     for axes, metric in zip(panels, metrics, strict=True):
-        for height, (row, colour) in zip(heights, zip(cells.values(), _cycle(COLOURS), strict=False), strict=True):
+        for height, (row, colour) in zip(heights, zip(cells.values(), cycle(COLOURS), strict=False), strict=True):
             cell = row[metric]
             axes.plot([cell.low, cell.high], [height, height], color=colour, linewidth=1.6, solid_capstyle="butt")
             axes.plot(cell.mean, height, "o", color=colour, markersize=5)
@@ -79,7 +81,7 @@ def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str], tit
     grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
     thresholds = np.linspace(0.0, 1.0, 201)
     for axes, result in zip(grid.ravel(), results, strict=False):
-        for (method, scores), colour in zip(result.scores.items(), _cycle(COLOURS), strict=False):
+        for (method, scores), colour in zip(result.scores.items(), cycle(COLOURS), strict=False):
             axes.plot(
                 thresholds, performance_profile(scores, thresholds), color=colour, linewidth=1.2, label=titles[method]
             )
@@ -88,9 +90,7 @@ def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str], tit
     for axes in grid.ravel()[len(results) :]:
         axes.set_visible(False)
     grid[0, 0].set_ylabel("share above τ", fontsize=8)
-    figure.legend(
-        *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=7
-    )
+    _legend_below(figure, grid[0, 0], 3)
     _entitle(figure, title)
     return finish(figure)
 
@@ -104,7 +104,7 @@ def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> F
     """
     figure = new_figure(WIDTH, 2.7)
     returns, crashes = figure.subplots(1, 2)
-    for (label, seeds), colour in zip(curves.items(), _cycle(COLOURS), strict=False):
+    for (label, seeds), colour in zip(curves.items(), cycle(COLOURS), strict=False):
         seeds = [seed for seed in seeds if len(seed)]
         if not seeds:
             continue
@@ -122,9 +122,7 @@ def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> F
     for axes in (returns, crashes):
         axes.set_xlabel("actions [million]", fontsize=8)
     if len(curves) > 1:
-        figure.legend(
-            *returns.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=7
-        )
+        _legend_below(figure, returns, 6)
     _entitle(figure, title)
     return finish(figure)
 
@@ -160,22 +158,16 @@ def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame, title: str) ->
         axes.set_title(label, loc="left", fontsize=8)
         axes.set_xlabel("replay update", fontsize=7)
     axes = grid[1, 2]
+    variances = gradients.pivot_table(index="adaptation_seed", columns="rule", values="gradient_variance")
     for place, rule in enumerate(RULES):
-        values = gradients.loc[gradients["rule"] == rule].sort_values("adaptation_seed")["gradient_variance"].to_numpy()
-        reference = (
-            gradients.loc[gradients["rule"] == "uniform"].sort_values("adaptation_seed")["gradient_variance"].to_numpy()
-        )
-        ratio = values / reference
-        axes.plot(
-            np.full(len(ratio), place) + np.linspace(-0.15, 0.15, len(ratio)), ratio, ".", color=RULE_COLOURS[rule]
-        )
+        ratio = variances[rule].to_numpy() / variances["uniform"].to_numpy()
+        spread = place + np.linspace(-0.15, 0.15, len(ratio))
+        axes.plot(spread, ratio, ".", color=RULE_COLOURS[rule])
         axes.plot(place, float(np.median(ratio)), "_", color=INK, markersize=14)
     axes.set_yscale("log")
     axes.set_xticks(range(len(RULES)), list(RULES.values()), fontsize=7)
     axes.set_title("gradient variance (mean β 1),\nover that of β = 1", loc="left", fontsize=8)
-    figure.legend(
-        *grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8
-    )
+    _legend_below(figure, grid[0, 0], 3)
     _entitle(figure, title)
     return finish(figure)
 
@@ -210,6 +202,12 @@ def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame, title: str) ->
     return finish(figure)
 
 
+def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    """Draw the legend of one panel below all of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
+
+
 def _entitle(figure: Figure, title: str) -> None:
     """A title in as many lines as it needs."""
     figure.suptitle(textwrap.fill(title, TITLE_WIDTH), x=0.01, ha="left", fontsize=10, fontweight="bold")
@@ -228,7 +226,3 @@ def read_learning(folder: Path) -> pd.DataFrame:
         return pd.DataFrame(columns=["step", *names])
     columns = {name: {event.step: event.value for event in log.Scalars(tag)} for name, tag in names.items()}
     return pd.DataFrame(columns).rename_axis("step").sort_index().reset_index()
-
-
-def _cycle(colours: Sequence[str]) -> list[str]:
-    return list(colours) * 4
