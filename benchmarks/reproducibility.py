@@ -119,7 +119,8 @@ def mql(folder: Path) -> str:
 
 def adaptation(folder: Path) -> str:
     from outlap.envs import RaceVectorEnv, SB3VecEnv
-    from outlap.mql.adaptation import AdaptationSettings, adapt
+    from outlap.mql.adaptation import adapt
+    from outlap.mql.config import AdaptationConfig
     from outlap.mql.mql import MQL
     from outlap.training.run import load_run
 
@@ -128,7 +129,7 @@ def adaptation(folder: Path) -> str:
     meta.load_replay_buffer(run.replay_path)
     task = SB3VecEnv(RaceVectorEnv(8, run.config.env.model_copy(update={"tracks": ("Brackenfell",)})))
     task.seed(3)
-    policy, record = adapt(meta, task, AdaptationSettings(iterations=2, collect_steps=40))
+    policy, record = adapt(meta, task, AdaptationConfig(iterations=2, collect_steps=40))
     return digest(repr(record.updates), *(value.numpy() for value in policy.state_dict().values()))
 
 

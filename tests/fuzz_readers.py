@@ -23,8 +23,7 @@ from typing import Any
 # Numba compiles these functions: it cannot read bytecode that counts its branches.
 COMPILED = [
     "outlap.simulator", "outlap.track.distance",
-    "outlap.planning.corridor", "outlap.planning.speed_profile", "outlap.mql.gather", "outlap.mql.gru",
-    "outlap.mql.lanes", "outlap.mql.torch_threads",
+    "outlap.planning.corridor", "outlap.planning.speed_profile",
 ]  # fmt: skip
 SLOWEST = 20  # [s] that a file may take
 MEMORY = 4096  # [MB]

@@ -17,7 +17,7 @@ from outlap.drivers.mlp import MLPDriver
 from outlap.drivers.population import MANIFEST, SHIPPED, load_population, read_manifest
 from outlap.errors import OutlapError
 from outlap.evaluation.recording import Recording
-from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.replay import ReplayBuffer
 from outlap.planning.friction import FrictionMap
 from outlap.track.archive import extract
 from outlap.track.generate import generate_track
@@ -30,7 +30,7 @@ from synthetic_tracks import ring
 
 def replay_file(folder: Path) -> Path:
     box = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
-    buffer = HistoryBuffer(20, gym.spaces.Dict({"vel": box}), 2, 1)
+    buffer = ReplayBuffer(20, gym.spaces.Dict({"vel": box}), 2, 1)
     one = np.zeros(1, np.int64)
     buffer.begin(one, {"vel": np.ones((1, 3), np.float32)}, ["a"])
     for _ in range(6):
@@ -97,7 +97,7 @@ FRICTION = "s_m,d_m,mu\n" + "".join(f"{s},{d},{0.8}\n" for s in range(0, 20, 5) 
 
 READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
     "recording": (lambda folder: circling(ring(), beams=5).save(folder / "a.npz"), Recording.load),
-    "replay": (replay_file, HistoryBuffer.load),
+    "replay": (replay_file, ReplayBuffer.load),
     "map yaml": (track_file(".yaml"), of_folder(read_track)),
     "map png": (track_file(".png"), of_folder(read_track)),
     "centreline": (track_file("centerline.csv"), of_folder(read_track)),

@@ -23,12 +23,8 @@ FRONT_DOORS = ("outlap", "outlap.__main__")  # may import any package, and nothi
 # What the code does not keep to yet; to be empty.
 UPWARDS: set[str] = set()
 IN_CYCLES: set[str] = set()
-LONG_MODULES: set[str] = {"outlap.mql.buffers"}
-LONG_FUNCTIONS: set[str] = {
-    "outlap.mql.adaptation.adapt",
-    "outlap.mql.learner.td3_update",
-    "outlap.mql.mql.__init__",
-}
+LONG_MODULES: set[str] = set()
+LONG_FUNCTIONS: set[str] = set()
 
 
 @cache

@@ -243,8 +243,9 @@ def explain(error: ValidationError, cls: type[BaseModel] | None = None, prefix: 
 def _hint(cls: type[BaseModel] | None, location: Sequence[int | str]) -> str:
     model = cls
     for part in location[:-1]:
-        if model is not None and isinstance(part, str) and part in model.model_fields:
-            model = _model_in(model.model_fields[part].annotation)
+        if model is not None and isinstance(part, str):
+            known = model.model_fields.get(part)  # none where the part names a member of a union
+            model = None if known is None else _model_in(known.annotation)
     if model is None:
         return ""
     names = list(model.model_fields)

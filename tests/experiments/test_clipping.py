@@ -9,14 +9,15 @@ import pytest
 import torch
 
 from outlap.experiments.clipping import BETA_EDGES, compare_rules, gradient_variance
-from outlap.mql.adaptation import AdaptationSettings, collect, features, fit_to
-from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.adaptation import collect, features, fit_to
+from outlap.mql.config import AdaptationConfig
 from outlap.mql.learner import criticise
 from outlap.mql.mql import MQL
 from outlap.mql.propensity import CLIP_RULES
+from outlap.mql.replay import ReplayBuffer
 from toy_tasks import HiddenGoal
 
-SETTINGS = AdaptationSettings(iterations=2, collect_steps=20, on_task_steps=1, replay_steps=4, batch_size=32)
+SETTINGS = AdaptationConfig(iterations=2, collect_steps=20, on_task_steps=1, replay_steps=4, batch_size=32)
 
 
 @pytest.fixture(scope="module")
@@ -30,15 +31,15 @@ def meta() -> MQL:
 
 
 @pytest.fixture(scope="module")
-def new(meta: MQL) -> HistoryBuffer:
+def new(meta: MQL) -> ReplayBuffer:
     return collect(meta, HiddenGoal(8, 1.4, 1.4, seed=3), SETTINGS)
 
 
-def test_as_much_is_collected_as_in_an_adaptation(new: HistoryBuffer):
+def test_as_much_is_collected_as_in_an_adaptation(new: ReplayBuffer):
     assert new.transitions() == 8 * SETTINGS.collect_steps * SETTINGS.iterations
 
 
-def test_all_rules_see_the_same_weights_and_batches(meta: MQL, new: HistoryBuffer):
+def test_all_rules_see_the_same_weights_and_batches(meta: MQL, new: ReplayBuffer):
     before = [parameter.detach().clone() for parameter in meta.policy.parameters()]
     shares: list[float] = []
     found = compare_rules(meta, new, SETTINGS, 5, 4, shares.append)
@@ -64,7 +65,7 @@ def test_all_rules_see_the_same_weights_and_batches(meta: MQL, new: HistoryBuffe
     assert all(torch.equal(a, b) for a, b in zip(before, meta.policy.parameters(), strict=True))
 
 
-def test_the_variance_of_the_gradient_is_that_of_gradients_kept_one_by_one(meta: MQL, new: HistoryBuffer):
+def test_the_variance_of_the_gradient_is_that_of_gradients_kept_one_by_one(meta: MQL, new: ReplayBuffer):
     table = gradient_variance(meta, new, SETTINGS, seed=2, batches=5).set_index("rule")
     # The same batches, drawn in the same order; gradients of β = 1 and of unclipped weights as rows of a matrix.
     rng, noise = np.random.default_rng(2), torch.Generator().manual_seed(2)
@@ -78,7 +79,7 @@ def test_the_variance_of_the_gradient_is_that_of_gradients_kept_one_by_one(meta:
         for name, weights in (("uniform", np.ones_like(beta)), ("none", 7.0 * beta)):  # any factor is divided out
             noise.set_state(state)
             policy.zero_grad()
-            errors = criticise(policy, batch, meta.settings, noise).errors
+            errors = criticise(policy, batch, meta.td3, noise).errors
             (torch.as_tensor(weights / weights.mean(), dtype=torch.float32) * errors).mean().backward()
             gradient = [p.grad for p in (*policy.critic.parameters(), *policy.context.parameters())]
             rows[name].append(np.concatenate([g.numpy().ravel().astype(np.float64) for g in gradient if g is not None]))

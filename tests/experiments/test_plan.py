@@ -198,9 +198,12 @@ def test_all_methods_of_a_budget_are_trained_for_the_same_penalties(whole: Plan)
         ("training: {algorithm: mql}\nadaptation: {clip: half}", "adaptation: clip is 'half'; must be"),
         (
             "training: {algorithm: mql}\nadaptation: {clip: {rule: abc, kk: 2}}",
-            "adaptation: clip abc: kk is not a known",
+            "adaptation: clip.abc.kk is not a known",
         ),
-        ("training: {algorithm: mql}\nadaptation: {clip: abc, iterations: 2.5}", "iterations is 2.5; must be a whole"),
+        (
+            "training: {algorithm: mql}\nadaptation: {clip: abc, iterations: 2.5}",
+            "iterations is 2.5; must be a valid integer",
+        ),
         ("training: {algorithm: a2c}", "algorithm is 'a2c'; must be one of ppo"),
         ("driver: nobody", "driver is 'nobody'; must be"),
         ("driver: antigravity:fly", "driver antigravity:fly: is a module, which runs code when it is imported"),

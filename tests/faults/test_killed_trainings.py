@@ -17,7 +17,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from commands import Commands, leftovers
 from outlap.cli.main import main
 from outlap.experiments.figures import read_learning
-from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.replay import ReplayBuffer
 from outlap.training.run import Run, load_run
 
 pytestmark = pytest.mark.slow
@@ -75,7 +75,7 @@ def check_whole(run: Run) -> None:
     if run.config.algorithm == "ppo":  # a row every 64 actions, from the first episode that ended
         np.testing.assert_array_equal(steps, np.arange(int(steps[0]), total + 1, 64))
     else:
-        assert HistoryBuffer.load(run.replay_path).transitions() == total
+        assert ReplayBuffer.load(run.replay_path).transitions() == total
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "mql"])

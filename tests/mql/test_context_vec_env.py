@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import VecEnv
 
-from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.collector import add_step, begin_episodes
 from outlap.mql.context_vec_env import ContextVecEnv
 from outlap.mql.networks import PREVIOUS_REWARD
+from outlap.mql.replay import ReplayBuffer
 
 BOX = gym.spaces.Box(-100.0, 100.0, (2,), np.float32)
 REWARD = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
@@ -240,11 +241,11 @@ def test_in_a_replay_the_term_is_the_reward_of_the_row(kind: str) -> None:
     """Also in an episode's last row, which the replay takes from the terminal observation."""
     env = ContextVecEnv(Script(kind))
     assert isinstance(env.observation_space, gym.spaces.Dict)
-    buffer = HistoryBuffer(100, env.observation_space, 1, 2)
-    buffer.begin_all(env, reset(env))
+    buffer = ReplayBuffer(100, env.observation_space, 1, 2)
+    begin_episodes(buffer, env, reset(env))
     for _ in range(5):
         observation, rewards, dones, infos = step(env)
-        buffer.add_step(env, observation, ACTIONS, rewards, dones, infos)
+        add_step(buffer, env, observation, ACTIONS, rewards, dones, infos)
     assert buffer.added == 2 + 5 * 2 + 3
     # begin; step 1; step 2 and world 1's next episode; step 3; step 4 and two episodes; step 5.
     expected = [0, 0, 1, -2, 3, 4.5, 0, 5, 6, -7, 8, 0, 0, 9, 10]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
-from outlap.mql.buffers import HistoryBuffer
-from outlap.mql.learner import TD3Settings, td3_update
-from outlap.mql.policies import MQLPolicy, to_tensor
+from outlap.mql.config import TD3Config
+from outlap.mql.learner import td3_update
+from outlap.mql.policies import MQLPolicy
+from outlap.mql.replay import ReplayBuffer
 
 SPACE = gym.spaces.Dict(
     {
@@ -22,13 +22,13 @@ SPACE = gym.spaces.Dict(
     }
 )
 ACTIONS = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-STILL = TD3Settings(policy_noise=0.0)  # no noise on target actions
+STILL = TD3Config(policy_noise=0.0)  # no noise on target actions
 
 
 def replay(n_steps: int = 1):
     """A batch from some random episodes."""
     rng = np.random.default_rng(0)
-    buffer = HistoryBuffer(400, SPACE, 2, 4)
+    buffer = ReplayBuffer(400, SPACE, 2, 4)
 
     def seen() -> dict[str, np.ndarray]:
         return {name: rng.normal(size=(4, *box.shape)).astype(np.float32) for name, box in SPACE.spaces.items()}  # type: ignore[misc]
@@ -52,18 +52,11 @@ def policy(preset: str, **kwargs) -> MQLPolicy:
     return made
 
 
-class PlainDescent(torch.optim.SGD):
-    def step_clipped(self, max_norm: float) -> torch.Tensor:
-        norm = torch.nn.utils.clip_grad_norm_(self.param_groups[0]["params"], max_norm)
-        self.step()
-        return norm
-
-
 def use_plain_gradient_descent(p: MQLPolicy) -> None:
     """In place of Adam, whose first step is the gradient's sign: where that is as good as 0, rounding decides."""
     p.make_optimizers(1e-2)
     p.actor_optimizer, p.critic_optimizer = (  # type: ignore[assignment]
-        PlainDescent(optimizer.param_groups[0]["params"], lr=1e-2)
+        torch.optim.SGD(optimizer.param_groups[0]["params"], lr=1e-2)
         for optimizer in (p.actor_optimizer, p.critic_optimizer)
     )
 
@@ -72,20 +65,19 @@ def plain_losses(p: MQLPolicy, batch, n_steps: int):
     """The TD3 losses, each part computed anew and by itself."""
 
     def z(columns: torch.Tensor) -> torch.Tensor:
-        steps, valid = p.steps(batch.windows)
         each, rows = torch.arange(len(columns)), columns.t()
-        return p.context(steps[rows, each], valid[rows, each], len(rows))[0]
+        return p.context(p.steps(batch.windows)[rows, each], batch.windows.valid[rows, each])
 
     here = torch.arange(5)[None].expand(len(batch.action), 5)
-    there = here + torch.as_tensor(batch.steps)[:, None]
+    there = here + batch.steps[:, None]
     names = p.critic.encoder.encoders
-    now = {name: to_tensor(batch.observation[name], p.device) for name in names}
-    then = {name: to_tensor(batch.next_observation[name], p.device) for name in names}
+    now = {name: batch.observation[name] for name in names}
+    then = {name: batch.next_observation[name] for name in names}
     actor_encoder = p.critic_target.encoder if p.shares_encoder else p.actor_target.encoder
     action = p.actor_target(actor_encoder(then), z(there).detach())
     q = p.critic_target(p.critic_target.encoder(then), action, z(there).detach()).min(0).values
-    target = (to_tensor(batch.reward, p.device) + to_tensor(batch.discount, p.device) * q).detach()
-    values = p.critic(p.critic.encoder(now), to_tensor(batch.action, p.device), z(here))
+    target = (batch.reward + batch.discount * q).detach()
+    values = p.critic(p.critic.encoder(now), batch.action, z(here))
     each = ((values - target) ** 2).sum(0)
     mine = p.critic.encoder(now).detach() if p.shares_encoder else p.actor.encoder(now)
     chosen = p.actor(mine, z(here))
@@ -97,7 +89,7 @@ def plain_losses(p: MQLPolicy, batch, n_steps: int):
 @pytest.mark.parametrize("preset", ["paper", "fast"])
 @pytest.mark.parametrize("max_grad_norm", [0.01, 1e9])
 def test_an_update_is_a_plain_td3_step_of_both_losses(preset: str, n_steps: int, max_grad_norm: float) -> None:
-    batch, settings = replay(n_steps), replace(STILL, max_grad_norm=max_grad_norm)
+    batch, settings = replay(n_steps), STILL.model_copy(update={"max_grad_norm": max_grad_norm})
     weights = torch.linspace(0.1, 3.0, 64)
     ours = policy(preset)
     theirs = copy.deepcopy(ours)
@@ -176,7 +168,7 @@ def test_the_proximal_term_pulls_towards_its_anchor() -> None:
 
 
 def test_without_context_the_policy_is_deaf_to_its_history() -> None:
-    batch = replay()
+    windows = replay().windows.first(5)
     deaf, hears = policy("fast", uses_context=False), policy("fast")
-    assert not deaf.encode(batch.windows).any()
-    assert hears.encode(batch.windows).std(0).min() > 0
+    assert not deaf.encode(windows).any()
+    assert hears.encode(windows).std(0).min() > 0

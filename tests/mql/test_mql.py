@@ -13,7 +13,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor
 
 from outlap.errors import OutlapError
-from outlap.mql.adaptation import AdaptationSettings, adapt, features
+from outlap.mql.adaptation import adapt, features
+from outlap.mql.config import AdaptationConfig
 from outlap.mql.context_vec_env import ContextVecEnv
 from outlap.mql.mql import MQL
 from outlap.mql.propensity import AdaptiveBetaClip, FixedClip, NoClip, fit_propensity
@@ -72,7 +73,7 @@ def test_context_finds_a_goal_that_nothing_else_tells(meta: MQL) -> None:
 def test_adapting_improves_a_goal_further_out_than_any_before(meta: MQL) -> None:
     before, replay = weights(meta), meta.replay_buffer.added
     optimizer = copy.deepcopy(meta.policy.critic_optimizer.state_dict())
-    settings = AdaptationSettings(
+    settings = AdaptationConfig(
         iterations=4, collect_steps=40, on_task_steps=20, replay_steps=20, batch_size=128, learning_rate=1e-3,
         clip=FixedClip(),
     )  # fmt: skip
@@ -91,7 +92,7 @@ def test_adapting_improves_a_goal_further_out_than_any_before(meta: MQL) -> None
 
 
 def test_a_task_like_all_others_weighs_its_replay_evenly(meta: MQL) -> None:
-    settings = AdaptationSettings(iterations=1, on_task_steps=0, replay_steps=5, clip=NoClip())
+    settings = AdaptationConfig(iterations=1, on_task_steps=0, replay_steps=5, clip=NoClip())
     _, record = adapt(meta, meta.replay_buffer, settings)
     row = record.iterations[0]
     assert row["classifier_accuracy"] == pytest.approx(0.5, abs=0.1)
@@ -100,7 +101,7 @@ def test_a_task_like_all_others_weighs_its_replay_evenly(meta: MQL) -> None:
 
 
 def test_adaptive_clipping_starts_afresh_with_every_adaptation(meta: MQL) -> None:
-    settings = AdaptationSettings(
+    settings = AdaptationConfig(
         iterations=1, collect_steps=20, on_task_steps=0, replay_steps=3, clip=AdaptiveBetaClip()
     )
     first, second = (adapt(meta, HiddenGoal(8, 1.4, 1.4, seed=3), settings)[1].updates for _ in range(2))

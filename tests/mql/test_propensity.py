@@ -194,7 +194,7 @@ def test_no_clip_leaves_the_weights_as_they_are() -> None:
 
 def test_the_fixed_clip_is_at_the_exponential_of_its_bound() -> None:
     e = math.e
-    clipped, level = FixedClip(2.0).start().clip(np.array([0.0, 1.0, e**2 - 1e-9, e**2 + 1e-3, 1e9]))
+    clipped, level = FixedClip(bound=2.0).start().clip(np.array([0.0, 1.0, e**2 - 1e-9, e**2 + 1e-3, 1e9]))
     assert level == pytest.approx(e**2)
     np.testing.assert_allclose(clipped, [0.0, 1.0, e**2 - 1e-9, e**2, e**2], rtol=1e-12)
 
@@ -268,7 +268,7 @@ def test_single_precision_weights_are_averaged_in_double() -> None:
 def test_the_rules_have_names() -> None:
     assert {name: rule() for name, rule in CLIP_RULES.items()} == {
         "none": NoClip(),
-        "fixed": FixedClip(1.5),
+        "fixed": FixedClip(bound=1.5),
         "abc": AdaptiveBetaClip(k=2.5, momentum=0.9),
     }
 
@@ -278,7 +278,7 @@ batches = st.lists(
 )
 
 
-@pytest.mark.parametrize("rule", [FixedClip(0.5), AdaptiveBetaClip(), AdaptiveBetaClip(k=0.0, momentum=0.5)])
+@pytest.mark.parametrize("rule", [FixedClip(bound=0.5), AdaptiveBetaClip(), AdaptiveBetaClip(k=0.0, momentum=0.5)])
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(batches=batches)
 def test_the_variance_of_a_clipped_loss_is_bounded_by_its_level(rule, batches: list[list[tuple[float, float]]]) -> None:

@@ -12,8 +12,8 @@ from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.rollout import evaluate
-from outlap.mql.buffers import HistoryBuffer
 from outlap.mql.mql import MQL
+from outlap.mql.replay import ReplayBuffer
 from outlap.track import load_track
 from outlap.training.mql import MQLConfig
 from outlap.training.run import load_run
@@ -39,10 +39,10 @@ def test_a_stopped_run_goes_on_with_its_replay() -> None:
     run = load_run("run")
     assert isinstance(run.config, MQLConfig)
     assert load_config(MQLConfig, run.folder / "config.yaml") == SMALL
-    before = HistoryBuffer.load(run.replay_path)
+    before = ReplayBuffer.load(run.replay_path)
     assert before.transitions() == 256
     train(run.config, run.folder, resume=run)
-    after = HistoryBuffer.load(run.replay_path)
+    after = ReplayBuffer.load(run.replay_path)
     assert after.transitions() == 640
     for name in ("scan", "vel"):  # what was seen before the stop, and then the rest
         np.testing.assert_array_equal(after.observation[name][: before.added], before.observation[name][: before.added])

@@ -19,7 +19,8 @@ from outlap.envs import RaceVectorEnv, SB3VecEnv
 from outlap.envs.race_config import RaceConfig
 from outlap.evaluation.rollout import evaluate
 from outlap.experiments.figures import read_learning
-from outlap.mql.adaptation import AdaptationSettings, adapt
+from outlap.mql.adaptation import adapt
+from outlap.mql.config import AdaptationConfig
 from outlap.mql.mql import MQL
 from outlap.track import load_track
 from outlap.training.config import TrainingConfig
@@ -134,7 +135,7 @@ def test_an_adaptation_and_an_evaluation_repeat_their_rows(threads):
         meta.load_replay_buffer(run.replay_path)
         task = SB3VecEnv(RaceVectorEnv(4, run.config.env))
         task.seed(5)
-        settings = AdaptationSettings(iterations=1, collect_steps=20, on_task_steps=2, replay_steps=3)
+        settings = AdaptationConfig(iterations=1, collect_steps=20, on_task_steps=2, replay_steps=3)
         policy, record = adapt(meta, task, settings, seed=2)
         updates.append(repr(record.updates))
         weights.append(np.concatenate([value.numpy().ravel() for value in policy.state_dict().values()]))

@@ -28,7 +28,7 @@ from outlap.deploy.car_driver import ACTION, COMMAND, FORMAT, METADATA, NEXT_STA
 from outlap.envs.observations import scale_of
 from outlap.errors import OutlapError
 from outlap.files import atomic_write
-from outlap.mql.networks import PREVIOUS_REWARD, ContextEncoder
+from outlap.mql.networks import PREVIOUS_REWARD
 from outlap.training.model_file import load_model
 
 if TYPE_CHECKING:
@@ -212,12 +212,10 @@ class WithContext(Remembering):
     def __init__(self, policy: MQLPolicy) -> None:
         super().__init__()
         self.actor, self.encoder = policy.actor, policy.critic.encoder if policy.shares_encoder else None
-        self.context: ContextEncoder | None = policy.context if policy.uses_context else None
+        self.context = policy.context if policy.uses_context else None
         self.hidden = policy.context.hidden
         self.context_terms, self.uses_reward = policy.context_terms, policy.uses_reward
-        first = policy.context.inputs[0]
-        assert isinstance(first, nn.Linear)
-        self.rows, self.inputs = policy.history - 1, first.in_features
+        self.rows, self.inputs = policy.history - 1, policy.context.inputs
         self.memory_size = self.rows * (self.inputs + 1) if policy.uses_context else 0
 
     def forward(self, seen: dict[str, Tensor], before: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -229,7 +227,8 @@ class WithContext(Remembering):
         valid = torch.cat([valid, valid.new_ones(1)])
         window = torch.cat([window, step])
         kept = torch.cat([valid[1:], window[1:].flatten()])
-        return self.actor(embedding, self._encode(window, valid)), kept
+        context = self.context(window.unsqueeze(1), valid.unsqueeze(1) > 0.0)
+        return self.actor(embedding, context), kept
 
     def _read(self, seen: dict[str, Tensor], before: Tensor) -> list[Tensor]:
         """What the context reads of a step, as `MQLPolicy.steps` has it."""
@@ -241,24 +240,6 @@ class WithContext(Remembering):
             term = seen[name].half().float() if name == "scan" else seen[name]
             read.append(term if self.encoder is None else self.encoder.encoders[name](term))
         return read
-
-    def _encode(self, window: Tensor, valid: Tensor) -> Tensor:
-        """The context (1, hidden) of a window (rows, inputs): `mql.gru.gru`, written for a single one."""
-        assert self.context is not None
-        steps = window
-        for inputs, recurrent in zip(self.context.inputs, self.context.recurrent, strict=True):
-            projected = inputs(steps)
-            state = projected.new_zeros(1, self.hidden)
-            states = []
-            for x, there in zip(projected.split(1), valid.split(1), strict=True):
-                reset_x, update_x, candidate_x = x.chunk(3, -1)
-                reset_h, update_h, candidate_h = recurrent(state).chunk(3, -1)
-                update = torch.sigmoid(update_x + update_h)
-                candidate = torch.tanh(candidate_x + torch.sigmoid(reset_x + reset_h) * candidate_h)
-                state = there * (candidate + update * (state - candidate))
-                states.append(state)
-            steps = torch.cat(states)
-        return steps[-1:]
 
 
 def _policy(policy: Any) -> Remembering:

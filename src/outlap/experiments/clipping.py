@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import torch
 
-from outlap.mql.adaptation import AdaptationSettings, adapt, features, fit_to
-from outlap.mql.buffers import HistoryBuffer
+from outlap.mql.adaptation import adapt, features, fit_to
+from outlap.mql.config import AdaptationConfig
 from outlap.mql.learner import criticise
 from outlap.mql.mql import MQL
 from outlap.mql.propensity import CLIP_RULES, effective_sample_size
+from outlap.mql.replay import ReplayBuffer
 
 # log10 of the edges of a histogram of β, which reaches from exp(-30) to exp(30).
 BETA_EDGES = np.linspace(-13.2, 13.2, 133)
@@ -22,8 +22,8 @@ BETA_EDGES = np.linspace(-13.2, 13.2, 133)
 
 def compare_rules(
     meta: MQL,
-    new: HistoryBuffer,
-    settings: AdaptationSettings,
+    new: ReplayBuffer,
+    config: AdaptationConfig,
     seed: int,
     gradient_batches: int,
     report: Callable[[float], None],
@@ -33,7 +33,7 @@ def compare_rules(
     Args:
         meta: to adapt, with its replay.
         new: transitions of the task.
-        settings: of the adaptations; their clip rule is replaced.
+        config: of the adaptations; their clip rule is replaced.
         seed: of all batches, equal for every rule.
         gradient_batches: see `gradient_variance`.
         report: called with the share that is done.
@@ -52,17 +52,17 @@ def compare_rules(
                 row += np.histogram(np.log10(beta), BETA_EDGES)[0]
 
         def show(iteration: int, _: object, number: int = number) -> None:
-            report((number + (iteration + 1) / settings.iterations) / (len(CLIP_RULES) + 0.3))
+            report((number + (iteration + 1) / config.iterations) / (len(CLIP_RULES) + 0.3))
 
         _, record = adapt(
-            meta, new, replace(settings, clip=rule()), seed=seed, on_iteration=show, on_weights=count
+            meta, new, config.model_copy(update={"clip": rule()}), seed=seed, on_iteration=show, on_weights=count
         )  # fmt: skip
         iterations.append(pd.DataFrame(record.iterations).assign(rule=name))
         updates.append(pd.DataFrame(record.updates).assign(rule=name, update=np.arange(len(record.updates))))
         histograms.append(
             pd.DataFrame({"rule": name, "log10_beta": BETA_EDGES[:-1], "before": counts[0], "after": counts[1]})
         )
-    gradients = gradient_variance(meta, new, settings, seed, gradient_batches)
+    gradients = gradient_variance(meta, new, config, seed, gradient_batches)
     return {
         "updates": pd.concat(updates, ignore_index=True),
         "iterations": pd.concat(iterations, ignore_index=True),
@@ -71,9 +71,7 @@ def compare_rules(
     }
 
 
-def gradient_variance(
-    meta: MQL, new: HistoryBuffer, settings: AdaptationSettings, seed: int, batches: int
-) -> pd.DataFrame:
+def gradient_variance(meta: MQL, new: ReplayBuffer, config: AdaptationConfig, seed: int, batches: int) -> pd.DataFrame:
     """How much the critics' gradient differs from batch to batch, at the meta-policy, with β of mean 1 in each batch.
 
     With that normalisation a rule gains nothing by making all weights smaller. The same batches and target noise for
@@ -87,16 +85,16 @@ def gradient_variance(
     noise = torch.Generator(meta.device).manual_seed(seed)
     policy = copy.deepcopy(meta.policy)
     parameters = [*policy.critic.parameters(), *policy.context.parameters()]
-    propensity = fit_to(meta, new, settings, rng)
+    propensity = fit_to(meta, new, config, rng)
     states = {name: rule().start() for name, rule in CLIP_RULES.items()}
     names = ["uniform", *states]
     mean = {name: [torch.zeros_like(p) for p in parameters] for name in names}
     square = dict.fromkeys(names, 0.0)
     size = dict.fromkeys(names, 0.0)
     for _ in range(batches):
-        batch = meta.draw(meta.replay_buffer, settings.batch_size, rng)
+        batch = meta.draw(meta.replay_buffer, config.batch_size, rng)
         raw = propensity.beta(features(meta.policy, batch))
-        errors = criticise(policy, batch, meta.settings, noise).errors
+        errors = criticise(policy, batch.to(meta.device), meta.td3, noise).errors
         for name in names:
             beta = np.ones_like(raw) if name == "uniform" else states[name].clip(raw)[0]
             weights = torch.as_tensor(beta / beta.mean(), dtype=torch.float32, device=meta.device)

@@ -109,7 +109,7 @@ class Budget(Config):
     )  # by algorithm, `all` for each: what differs from the defaults
     population: dict[str, Any] | None = None  # of the opponents' trainings; none: the population of outlap is used
     population_laps: int = Field(default=5, ge=1)  # that an opponent must complete from every start
-    adaptation: dict[str, Any] = Field(default={})  # what differs from `AdaptationSettings`
+    adaptation: dict[str, Any] = Field(default={})  # what differs from `AdaptationConfig`
     clipping_seeds: int = Field(default=10, ge=1)  # adaptations that clip rules are compared on
     gradient_batches: int = Field(default=32, ge=2)  # over which the variance of the gradient is taken
 

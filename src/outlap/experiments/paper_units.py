@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from outlap.config import save_config
+from outlap.config import save_config, validate
 from outlap.drivers.driver import Driver
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
-from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments.definitions import changed
 from outlap.experiments.opponent_units import PopulationUnit
 from outlap.experiments.unit import Report, Unit
+from outlap.mql.config import AdaptationConfig
 from outlap.training.config import TrainingConfig
 from outlap.training.run import load_meta
 
 if TYPE_CHECKING:
     from outlap.envs.sb3_vec_env import SB3VecEnv
-    from outlap.mql.adaptation import AdaptationSettings
     from outlap.mql.mql import MQL
     from outlap.training.run import Run
 
@@ -231,35 +230,6 @@ def collecting_env(env: RaceConfig, worlds: int, training_steps: int, seed: int)
     return collecting
 
 
-def adaptation_settings(changes: Mapping[str, Any]) -> AdaptationSettings:
-    """Settings from a method's and a budget's changes. Raises OutlapError for a field that is not known."""
-    from outlap.mql.adaptation import AdaptationSettings
-    from outlap.mql.propensity import CLIP_RULES
-
-    base = AdaptationSettings()
-    constants = {each.name: getattr(base, each.name) for each in fields(base) if each.name != "clip"}
-    wanted = dict(changes)
-    clip = wanted.pop("clip", {"rule": "abc"})
-    rule = dict(clip) if isinstance(clip, Mapping) else {"rule": clip}
-    name = rule.pop("rule", None)
-    if name not in CLIP_RULES:
-        raise OutlapError(
-            f"adaptation: clip is {clip!r}; must be, or have a rule that is, one of {', '.join(CLIP_RULES)}"
-        )
-    clipping = CLIP_RULES[name]()
-    of_rule = {each.name: getattr(clipping, each.name) for each in fields(clipping)}
-    _check_numbers("adaptation", wanted, constants)
-    _check_numbers(f"adaptation: clip {name}", rule, of_rule)
-    return replace(base, **wanted, clip=replace(clipping, **rule))
-
-
-def _check_numbers(where: str, changes: Mapping[str, Any], defaults: Mapping[str, Any]) -> None:
-    """Raises OutlapError for a field that is not known, or not a number of its default's kind."""
-    for name, value in changes.items():
-        if name not in defaults:
-            known = ", ".join(defaults) or "none"
-            raise OutlapError(f"{where}: {name} is not a known field; the fields are {known}")
-        whole = isinstance(defaults[name], int)
-        if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or value < 0:
-            kind = "a whole number" if whole else "a number"
-            raise OutlapError(f"{where}: {name} is {value!r}; must be {kind}, 0 or more")
+def adaptation_settings(changes: Mapping[str, Any]) -> AdaptationConfig:
+    """Return the constants with a method's and a budget's changes. Raises OutlapError for a wrong one."""
+    return validate(AdaptationConfig, changes, "adaptation")

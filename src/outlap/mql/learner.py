@@ -2,67 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from outlap.mql.buffers import Batch
-from outlap.mql.policies import MQLPolicy, to_tensor
-
-
-@dataclass(frozen=True)
-class TD3Settings:
-    """Constants of an update."""
-
-    tau: float = 0.005  # share of the targets' move towards the networks
-    policy_noise: float = 0.2  # standard deviation of the target action's noise
-    noise_clip: float = 0.5  # largest such noise
-    policy_delay: int = 2  # updates of the critics for one of the actor and the targets
-    max_grad_norm: float = 10.0
+from outlap.mql.config import TD3Config
+from outlap.mql.policies import MQLPolicy
+from outlap.mql.replay import Batch
 
 
-class Criticism(NamedTuple):
+class Critique(NamedTuple):
     """What the critics make of a batch."""
 
-    seen: dict[str, Tensor]  # (n, size) of each term
-    embedding: Tensor  # (n, size) of what is seen
-    context: Tensor  # (n, hidden)
+    embedding: Tensor  # (n, size) of the observation at the departure
+    context: Tensor  # (n, hidden) z at the departure
     values: Tensor  # (2, n)
     errors: Tensor  # (n,) squared TD error of both critics together: the loss of every transition
 
 
-def criticise(policy: MQLPolicy, batch: Batch, settings: TD3Settings, noise: torch.Generator) -> Criticism:
-    """The critics' values and losses, with their gradients."""
-    device = policy.device
-    action, reward, discount = (to_tensor(x, device) for x in (batch.action, batch.reward, batch.discount))
-    seen = {name: to_tensor(batch.observation[name], device) for name in policy.critic.encoder.encoders}
-    seen_next = {name: to_tensor(batch.next_observation[name], device) for name in policy.critic.encoder.encoders}
-    context, context_next = _contexts(policy, batch)
-
+def criticise(policy: MQLPolicy, batch: Batch, td3: TD3Config, noise: torch.Generator) -> Critique:
+    """Return the critics' values and losses, with their gradients."""
+    context, next_context = policy.contexts(batch.windows, batch.steps)
     with torch.no_grad():
-        embedding_next = policy.critic_target.encoder(seen_next)
-        chosen = policy.actor_target(
-            embedding_next if policy.shares_encoder else policy.actor_target.encoder(seen_next), context_next
-        )
-        jitter = torch.randn(chosen.shape, generator=noise, device=device) * settings.policy_noise
-        chosen = (chosen + jitter.clamp(-settings.noise_clip, settings.noise_clip)).clamp(-1.0, 1.0)
-        target = reward + discount * policy.critic_target(embedding_next, chosen, context_next).amin(0)
+        next_embedding = policy.critic_target.encoder(batch.next_observation)
+        seen_by_actor = next_embedding
+        if not policy.shares_encoder:
+            seen_by_actor = policy.actor_target.encoder(batch.next_observation)
+        next_action = policy.actor_target(seen_by_actor, next_context)
+        jitter = td3.policy_noise * torch.randn(next_action.shape, generator=noise, device=policy.device)
+        next_action = (next_action + jitter.clamp(-td3.noise_clip, td3.noise_clip)).clamp(-1.0, 1.0)
+        next_value = policy.critic_target(next_embedding, next_action, next_context).amin(0)
+        target = batch.reward + batch.discount * next_value
 
-    embedding = policy.critic.encoder(seen)
-    values = policy.critic(embedding, action, context)
-    return Criticism(seen, embedding, context, values, (values - target).square().sum(0))
+    embedding = policy.critic.encoder(batch.observation)
+    values = policy.critic(embedding, batch.action, context)
+    return Critique(embedding, context, values, (values - target).square().sum(0))
 
 
 def td3_update(
     policy: MQLPolicy,
     batch: Batch,
-    settings: TD3Settings,
+    td3: TD3Config,
     noise: torch.Generator,
     *,
     update_actor: bool,
-    weights: Tensor | None = None,
+    weights: Tensor | float = 1.0,
     anchor: list[Tensor] | None = None,
     anchor_weight: float = 0.0,
 ) -> dict[str, Tensor]:
@@ -74,10 +60,10 @@ def td3_update(
     Args:
         policy: to change.
         batch: transitions.
-        settings: constants.
+        td3: constants.
         noise: draws the noise of the target actions.
         update_actor: whether this is an update of the actor and the targets too.
-        weights: (n,) of the transitions in both losses; none: 1 each.
+        weights: (n,) of the transitions in both losses.
         anchor: values of `policy.adapted_parameters()` that the proximal term holds them to.
         anchor_weight: λ of the proximal term λ‖θ - anchor‖².
 
@@ -85,48 +71,46 @@ def td3_update(
         What can be logged, without gradient: losses, the variance of the transitions' losses, the mean of Q, the
         distance ‖θ - anchor‖².
     """
-    seen, embedding, context, values, each = criticise(policy, batch, settings, noise)
-    shared = policy.shares_encoder
-    critic_loss = (each if weights is None else weights * each).mean()
-    loss = critic_loss
-    record = {}
+    batch = batch.to(policy.device)
+    critique = criticise(policy, batch, td3, noise)
+    weighted = weights * critique.errors
+    loss = critic_loss = weighted.mean()
+    record = {
+        "critic_loss": critic_loss, "critic_loss_variance": weighted.detach().var(),
+        "td_error": critique.errors.detach().mean(), "q_value": critique.values.detach().mean(),
+    }  # fmt: skip
     if update_actor:
-        seen_by_actor = embedding.detach() if shared else policy.actor.encoder(seen)
-        chosen = policy.actor(seen_by_actor, context)
-        value = policy.critic(embedding.detach(), chosen, context.detach(), for_actor=True)[0]
-        actor_loss = -(value if weights is None else weights * value).mean()
-        loss = loss + actor_loss
-        record["actor_loss"] = actor_loss.detach()
+        record["actor_loss"] = -(weights * _value_of_own_action(policy, batch, critique)).mean()
+        loss = loss + record["actor_loss"]
     if anchor is not None:
-        distance = sum((p - at).square().sum() for p, at in zip(policy.adapted_parameters(), anchor, strict=True))
-        assert isinstance(distance, Tensor)
-        loss = loss + anchor_weight * distance
-        record["anchor_distance"] = distance.detach()
+        record["anchor_distance"] = _squared_distance(policy.adapted_parameters(), anchor)
+        loss = loss + anchor_weight * record["anchor_distance"]
 
-    for parameter in policy.adapted_parameters():
-        parameter.grad = None
+    policy.critic_optimizer.zero_grad()
+    policy.actor_optimizer.zero_grad()
     loss.backward()
-    grad_norm = policy.critic_optimizer.step_clipped(settings.max_grad_norm)
+    record["grad_norm"] = _descend(policy.critic_optimizer, td3.max_grad_norm)
     if update_actor:
-        policy.actor_optimizer.step_clipped(settings.max_grad_norm)
-        with torch.no_grad():
-            torch._foreach_lerp_(policy.targets, policy.followed, settings.tau)  # type: ignore[arg-type]
-    weighted = each.detach() if weights is None else weights * each.detach()
-    return {
-        "critic_loss": critic_loss.detach(),
-        "critic_loss_variance": weighted.var(),
-        "td_error": each.detach().mean(),
-        "q_value": values.detach().mean(),
-        "grad_norm": grad_norm.detach(),
-        **record,
-    }
+        _descend(policy.actor_optimizer, td3.max_grad_norm)
+        get_ema_multi_avg_fn(1.0 - td3.tau)(policy.targets, policy.followed, 0)
+    return {name: value.detach() for name, value in record.items()}
 
 
-def _contexts(policy: MQLPolicy, batch: Batch) -> tuple[Tensor, Tensor]:
-    """z where the transitions depart, and, without gradient, where they arrive."""
-    if not policy.uses_context:
-        zero = torch.zeros(len(batch.action), policy.context.hidden, device=policy.device)
-        return zero, zero
-    steps, valid = policy.steps(batch.windows)
-    later = torch.as_tensor(batch.steps, device=policy.device)
-    return policy.context(steps, valid, policy.history, later)
+def _value_of_own_action(policy: MQLPolicy, batch: Batch, critique: Critique) -> Tensor:
+    """Return the first critic's value (n,) of the actor's action; only the actor and its context get a gradient."""
+    embedding = critique.embedding.detach()
+    seen_by_actor = embedding if policy.shares_encoder else policy.actor.encoder(batch.observation)
+    action = policy.actor(seen_by_actor, critique.context)
+    return policy.critic(embedding, action, critique.context.detach(), for_actor=True)[0]
+
+
+def _squared_distance(parameters: list[nn.Parameter], anchor: list[Tensor]) -> Tensor:
+    pairs = zip(parameters, anchor, strict=True)
+    return torch.stack([(parameter - fixed).square().sum() for parameter, fixed in pairs]).sum()
+
+
+def _descend(optimizer: torch.optim.Optimizer, max_norm: float) -> Tensor:
+    """Take a step along the gradient, clipped to a norm; return the norm before."""
+    norm = nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], max_norm)
+    optimizer.step()
+    return norm

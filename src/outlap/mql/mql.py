@@ -1,15 +1,13 @@
 """MQL: Meta-Q-Learning (Fakoor et al., 2020) as a Stable-Baselines3 off-policy algorithm.
 
-TD3 over many tasks at once, its actor and critics conditioned on a context of the last steps that a GRU computes;
-the GRU is trained with them. Adapting to a task afterwards: `adaptation.adapt`.
+TD3 over many tasks at once, its actor and critics conditioned on a context of the last steps; the context's encoder is
+trained with them. Adapting to a task afterwards: `adaptation.adapt`.
 """
 
 from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -21,10 +19,12 @@ from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.errors import OutlapError
-from outlap.mql.buffers import Batch, HistoryBuffer
+from outlap.mql.collector import add_step, begin_episodes
+from outlap.mql.config import TD3Config
 from outlap.mql.context_vec_env import ContextVecEnv
-from outlap.mql.learner import TD3Settings, td3_update
+from outlap.mql.learner import td3_update
 from outlap.mql.policies import MQLPolicy
+from outlap.mql.replay import Batch, ReplayBuffer
 
 
 class MQL(OffPolicyAlgorithm):
@@ -32,7 +32,7 @@ class MQL(OffPolicyAlgorithm):
 
     policy: MQLPolicy
     policy_aliases = {"MQLPolicy": MQLPolicy}  # noqa: RUF012 - as the base class has it
-    replay_buffer: HistoryBuffer  # type: ignore[assignment]
+    replay_buffer: ReplayBuffer  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -42,24 +42,17 @@ class MQL(OffPolicyAlgorithm):
         buffer_size: int = 1_000_000,
         learning_starts: int = 10_000,
         batch_size: int = 256,
-        tau: float = 0.005,
         gamma: float = 0.99,
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = 1,
         n_steps: int = 1,
-        exploration_noise: float = 0.1,
-        policy_noise: float = 0.2,
-        noise_clip: float = 0.5,
-        policy_delay: int = 2,
+        td3: TD3Config | None = None,
         by_task: bool = True,
         task_buffer_size: int | None = None,
         policy_kwargs: dict[str, Any] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
         seed: int | None = None,
-        device: torch.device | str = "auto",
         _init_setup_model: bool = True,
+        **logging_and_device: Any,
     ) -> None:
         """Set up.
 
@@ -70,52 +63,28 @@ class MQL(OffPolicyAlgorithm):
             buffer_size: steps of all worlds that the replay keeps.
             learning_starts: steps of all worlds with random actions before the first update.
             batch_size: transitions of an update.
-            tau, policy_noise, noise_clip, policy_delay: see `learner.TD3Settings`.
             gamma: discount of a step.
             train_freq: steps of the vector environment between updates.
             gradient_steps: updates then; -1: as many as steps.
             n_steps: steps of a transition.
-            exploration_noise: standard deviation of the noise on actions while learning.
+            td3: constants of the update.
             by_task: draw every task as often as any other, and not every transition.
             task_buffer_size: newest transitions of a task that are drawn; None: all that are kept.
             policy_kwargs: see `MQLPolicy`: preset, history, uses_reward, uses_context.
             seed: of everything that is drawn.
+            logging_and_device: see Stable-Baselines3: stats_window_size, tensorboard_log, verbose, device.
         """
+        self.td3 = td3 or TD3Config()
         super().__init__(
-            policy,
-            env,  # type: ignore[arg-type]
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            n_steps=n_steps,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            seed=seed,
-            sde_support=False,
-            support_multi_env=True,
-        )
-        self.exploration_noise = exploration_noise
-        self.policy_noise = policy_noise
-        self.noise_clip = noise_clip
-        self.policy_delay = policy_delay
+            policy, env, learning_rate, buffer_size, learning_starts, batch_size, self.td3.tau, gamma, train_freq,  # type: ignore[arg-type]
+            gradient_steps, n_steps=n_steps, policy_kwargs=policy_kwargs, seed=seed, sde_support=False,
+            support_multi_env=True, **logging_and_device,
+        )  # fmt: skip
         self.by_task = by_task
         self.task_buffer_size = task_buffer_size
         self._n_updates = 0
         if _init_setup_model:
             self._setup_model()
-
-    @property
-    def settings(self) -> TD3Settings:
-        """Constants of an update."""
-        return TD3Settings(self.tau, self.policy_noise, self.noise_clip, self.policy_delay)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -125,7 +94,7 @@ class MQL(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.replay_buffer = HistoryBuffer(
+        self.replay_buffer = ReplayBuffer(
             self.buffer_size, self.observation_space, self.action_space.shape[0], self.n_envs,  # type: ignore[arg-type, index]
             task_capacity=self.task_buffer_size,
         )  # fmt: skip
@@ -147,7 +116,7 @@ class MQL(OffPolicyAlgorithm):
         if self._last_obs is not before:  # every world was reset
             assert self.env is not None
             assert isinstance(self._last_obs, dict)
-            self.replay_buffer.begin_all(self.env, self._last_obs)
+            begin_episodes(self.replay_buffer, self.env, self._last_obs)
         return done
 
     def _sample_action(
@@ -158,16 +127,16 @@ class MQL(OffPolicyAlgorithm):
             scaled = self._rng.uniform(-1.0, 1.0, size).astype(np.float32)
         else:
             assert isinstance(self._last_obs, dict)
-            scaled = self.policy.explore(self._last_obs, self.replay_buffer, self.exploration_noise, self._rng)
+            scaled = self.policy.explore(self._last_obs, self.replay_buffer, self.td3.exploration_noise, self._rng)
         return self.policy.unscale_action(scaled), scaled
 
     def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
         assert self.env is not None
         assert isinstance(new_obs, dict)
-        self.replay_buffer.add_step(self.env, new_obs, buffer_action, reward, dones, infos)
+        add_step(self.replay_buffer, self.env, new_obs, buffer_action, reward, dones, infos)
         self._last_obs = new_obs
 
-    def draw(self, buffer: HistoryBuffer, size: int, rng: np.random.Generator, *, by_task: bool = False) -> Batch:
+    def draw(self, buffer: ReplayBuffer, size: int, rng: np.random.Generator, *, by_task: bool = False) -> Batch:
         """Transitions of a buffer as this model learns from them: its history, n-step returns and discount."""
         return buffer.gather(
             buffer.sample(size, rng, by_task=by_task), history=self.policy.history, n_steps=self.n_steps,
@@ -175,7 +144,7 @@ class MQL(OffPolicyAlgorithm):
         )  # fmt: skip
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """Make so many updates from the replay."""
+        """Make `gradient_steps` updates from the replay."""
         policy = self.policy
         policy.set_training_mode(True)
         rate = self.lr_schedule(self._current_progress_remaining)
@@ -183,14 +152,12 @@ class MQL(OffPolicyAlgorithm):
         for optimizer in (policy.actor_optimizer, policy.critic_optimizer):
             update_learning_rate(optimizer, rate)
         records: dict[str, list[torch.Tensor]] = defaultdict(list)
-        settings = self.settings
-        with _in_bfloat16(policy):
-            for _ in range(gradient_steps):
-                self._n_updates += 1
-                batch = self.draw(self.replay_buffer, batch_size, self._rng, by_task=self.by_task)
-                update_actor = self._n_updates % self.policy_delay == 0
-                for name, value in td3_update(policy, batch, settings, self._noise, update_actor=update_actor).items():
-                    records[name].append(value)
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            batch = self.draw(self.replay_buffer, batch_size, self._rng, by_task=self.by_task)
+            update_actor = self._n_updates % self.td3.policy_delay == 0
+            for name, value in td3_update(policy, batch, self.td3, self._noise, update_actor=update_actor).items():
+                records[name].append(value)
         for name, values in records.items():
             mean = torch.stack(values).mean().item()
             if not np.isfinite(mean):
@@ -201,12 +168,12 @@ class MQL(OffPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def save_replay_buffer(self, path: str | os.PathLike[str]) -> None:  # type: ignore[override]
-        """Write the replay, see `HistoryBuffer.save`."""
+        """Write the replay, see `ReplayBuffer.save`."""
         self.replay_buffer.save(path)
 
     def load_replay_buffer(self, path: str | os.PathLike[str], truncate_last_traj: bool = True) -> None:  # type: ignore[override]
-        """Take up a replay that `save_replay_buffer` wrote, of any number of worlds; see `HistoryBuffer.load`."""
-        self.replay_buffer = HistoryBuffer.load(path)
+        """Take up a replay that `save_replay_buffer` wrote, of any number of worlds; see `ReplayBuffer.load`."""
+        self.replay_buffer = ReplayBuffer.load(path)
         self.replay_buffer.forget_worlds(self.n_envs)
         self._last_obs = None  # so that `learn` begins new episodes
 
@@ -215,18 +182,3 @@ class MQL(OffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.actor_optimizer", "policy.critic_optimizer"], []
-
-
-@contextmanager
-def _in_bfloat16(policy: MQLPolicy) -> Iterator[None]:
-    """The products of the context's inputs are made in bfloat16 if the preset says so and the CPU computes with it."""
-    policy.context.in_bfloat16 = policy.trains_in_bfloat16 and policy.device.type == "cpu" and _computes_in_bfloat16()
-    try:
-        yield
-    finally:
-        policy.context.in_bfloat16 = False
-
-
-def _computes_in_bfloat16() -> bool:
-    can = getattr(torch.cpu, "get_capabilities", dict)()
-    return bool(can.get("avx512_bf16") or can.get("amx_bf16"))

@@ -11,42 +11,59 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from outlap.mql.gru import Layer, gru
-
 PREVIOUS_REWARD = "previous_reward"  # the observation term that the context takes the reward from
 
 
-class ContextEncoder(nn.Module):
-    """A GRU over a window of (action, reward, observation): what the last steps tell of the task.
+def windows_from(rows: Tensor, first: Tensor, length: int) -> Tensor:
+    """Return `length` rows of each of n sequences, beginning where each says; past the last row comes the first.
 
-    Before an episode's start the hidden state stays 0.
+    Args:
+        rows: (any number, n, ...).
+        first: int64 (n,).
+        length: of the windows.
     """
+    number, n = rows.shape[:2]
+    taken = (first + torch.arange(length, device=first.device)[:, None]) % number
+    index = taken * n + torch.arange(n, device=first.device)
+    return rows.flatten(0, 1).index_select(0, index.flatten()).unflatten(0, (length, n))
+
+
+class GRUContext(nn.Module):
+    """A GRU over a window of (action, reward, observation); before an episode's start its state stays 0."""
 
     def __init__(self, inputs: int, hidden: int, layers: int) -> None:
         super().__init__()
-        self.hidden = hidden
-        self.in_bfloat16 = False  # for the products of the first layer's inputs
-        self.inputs = nn.ModuleList(nn.Linear(inputs if i == 0 else hidden, 3 * hidden) for i in range(layers))
-        self.recurrent = nn.ModuleList(nn.Linear(hidden, 3 * hidden) for _ in range(layers))
-        for parameter in self.parameters():
-            nn.init.uniform_(parameter, -1.0 / math.sqrt(hidden), 1.0 / math.sqrt(hidden))
+        self.inputs, self.hidden = inputs, hidden
+        self.gru = nn.GRU(inputs, hidden, layers)
 
-    def forward(
-        self, steps: Tensor, valid: Tensor, length: int, later: Tensor | None = None
-    ) -> tuple[Tensor, Tensor | None]:
-        """The context z (n, hidden) after a window's last step, and, without gradient, that of a later window.
+    def forward(self, steps: Tensor, valid: Tensor) -> Tensor:
+        """Return the context z (n, hidden): the last layer's state after the last step.
+
+        The windows are shifted to begin with the episode. A state does not depend on the steps after it, so what is
+        behind the last step does no harm.
 
         Args:
-            steps: (rows, n, inputs).
-            valid: (rows, n), 0 before the episode's start and 1 after.
-            length: rows of a window, for z the first.
-            later: int64 (n,) the row where the later window begins; by default there is none.
-
-        Raises ValueError where shapes do not fit, or a window leaves the rows.
+            steps: (length, n, inputs).
+            valid: bool (length, n), False before the episode's start.
         """
-        pairs = zip(self.inputs, self.recurrent, strict=True)
-        layers = [Layer(x.weight, x.bias, h.weight, h.bias) for x, h in pairs]  # type: ignore[arg-type]
-        return gru(steps, valid, length, layers, later, in_bfloat16=self.in_bfloat16)
+        known = valid.sum(0)
+        states, _ = self.gru(windows_from(steps, len(steps) - known, len(steps)))
+        last = windows_from(states, (known - 1).clamp(min=0), 1)[0]
+        return last * (known > 0)[:, None]
+
+
+class WindowContext(nn.Module):
+    """A perceptron over all steps of a window side by side."""
+
+    def __init__(self, inputs: int, hidden: int, length: int) -> None:
+        super().__init__()
+        self.inputs, self.hidden = inputs, hidden
+        self.layers = nn.Sequential(*_mlp(length * (inputs + 1), (128,), hidden), nn.Tanh())
+
+    def forward(self, steps: Tensor, valid: Tensor) -> Tensor:
+        """Return the context z (n, hidden) of windows: see `GRUContext`. Steps that are not valid count as zeros."""
+        present = valid[..., None].to(steps.dtype)
+        return self.layers(torch.cat([steps * present, present], -1).transpose(0, 1).flatten(1))
 
 
 class ObservationEncoder(nn.Module):
@@ -141,12 +158,13 @@ class Preset:
     """How the networks are built; the class attributes are what presets differ in."""
 
     history = 10  # steps that the context is made of
-    context_hidden = 128  # a multiple of two registers, 32 with AVX-512: others leave the kernels of a CPU, see `gru`
-    context_layers = 2
     hidden: tuple[int, ...] = (256, 256)  # of actor and critics
     layer_norm = False  # in the critics
     shared_encoder = False  # actor, critics and context see through one encoder, which the critics' loss trains
-    trains_in_bfloat16 = False  # the context, in a meta-training; worth it from a few hundred inputs on
+
+    def context(self, inputs: int, history: int) -> GRUContext | WindowContext:
+        """Return the context encoder for windows of `history` steps of `inputs` numbers."""
+        return GRUContext(inputs, hidden=128, layers=2)
 
     def context_terms(self, space: gym.spaces.Dict) -> tuple[str, ...]:
         """The observation terms that the context is made of, PREVIOUS_REWARD aside."""
@@ -157,8 +175,10 @@ class Preset:
         width = 128 if name == "scan" else 64
         return nn.Sequential(*_mlp(size, [width], width), nn.ReLU(inplace=True)), width
 
-    def build(self, space: gym.spaces.Dict, actions: int, uses_reward: bool) -> tuple[ContextEncoder, Actor, Critic]:
-        """The networks for observations of `space`, which hold PREVIOUS_REWARD for the context alone."""
+    def build(
+        self, space: gym.spaces.Dict, actions: int, uses_reward: bool, history: int
+    ) -> tuple[GRUContext | WindowContext, Actor, Critic]:
+        """Return the networks for observations of `space`, which hold PREVIOUS_REWARD for the context alone."""
         sizes = {name: int(box.shape[0]) for name, box in space.spaces.items()}  # type: ignore[index]
 
         def encoder() -> tuple[ObservationEncoder, dict[str, int]]:
@@ -170,30 +190,23 @@ class Preset:
         actor_encoder = critic_encoder if self.shared_encoder else encoder()[0]
         of_term = widths if self.shared_encoder else sizes
         step = actions + int(uses_reward) + sum(of_term[name] for name in self.context_terms(space))
-        context = ContextEncoder(step, self.context_hidden, self.context_layers)
-        seen = sum(widths.values()) + self.context_hidden
+        context = self.context(step, history)
+        seen = sum(widths.values()) + context.hidden
         actor = Actor(actor_encoder, _mlp(seen, self.hidden, actions))
         critic = Critic(critic_encoder, TwinMLP(seen + actions, self.hidden, self.layer_norm))
         return context, actor, critic
 
 
 class Paper(Preset):
-    """The networks of the paper: its GRU reads whole observations as they are.
-
-    Products of the context's inputs in bfloat16 change its gradient by 0.3 to 2 %; another batch by twenty times that.
-    """
-
-    trains_in_bfloat16 = True
+    """The networks of the paper: its GRU reads whole observations as they are."""
 
 
 class Fast(Preset):
-    """For two cores: scans by convolution, a small GRU over embedded proprioception, LayerNorm critics.
+    """For two cores: scans by convolution, a perceptron over a window of embedded proprioception, LayerNorm critics.
 
     What tells one vehicle from another is in a few numbers: how it moved and steered. Scans stay out of the context.
     """
 
-    context_hidden = 32
-    context_layers = 1
     hidden = (128, 128)
     layer_norm = True
     shared_encoder = True
@@ -202,6 +215,9 @@ class Fast(Preset):
         """All but scan and pose, unless there is nothing else."""
         names = super().context_terms(space)
         return tuple(name for name in names if name not in ("scan", "pose")) or names
+
+    def context(self, inputs: int, history: int) -> GRUContext | WindowContext:
+        return WindowContext(inputs, hidden=32, length=history)
 
     def term_encoder(self, name: str, size: int) -> tuple[nn.Module, int]:
         if name == "scan" and size >= 16:

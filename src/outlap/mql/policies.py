@@ -15,16 +15,15 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor
 
 from outlap.errors import OutlapError
-from outlap.mql.adam import Adam
-from outlap.mql.buffers import HistoryBuffer, Windows
-from outlap.mql.networks import PRESETS, PREVIOUS_REWARD
+from outlap.mql.networks import PRESETS, PREVIOUS_REWARD, windows_from
+from outlap.mql.replay import ReplayBuffer, Windows
 
 
 @dataclass
 class Memory:
     """What `predict` knows of the steps before: hand it back as `state`."""
 
-    history: HistoryBuffer
+    history: ReplayBuffer
     action: np.ndarray  # (n, actions) chosen last
 
 
@@ -66,25 +65,23 @@ class MQLPolicy(BasePolicy):
         self.history = history or shape.history
         self.context_terms = shape.context_terms(observation_space)
         self.window_terms = (PREVIOUS_REWARD, *self.context_terms) if uses_reward else self.context_terms
-        self.context, self.actor, self.critic = shape.build(observation_space, self._actions, uses_reward)
+        self.context, self.actor, self.critic = shape.build(observation_space, self._actions, uses_reward, self.history)
         # Copied together, so that an encoder which both share stays shared.
         self.actor_target, self.critic_target = copy.deepcopy((self.actor, self.critic))
         self.actor_target.requires_grad_(False)
         self.critic_target.requires_grad_(False)
         self.shares_encoder = shape.shared_encoder
         # Parameters of the targets and those that they follow, in the same order; what actor and critics share once.
-        self.targets, self.followed = (
-            list(torch.nn.ModuleList(pair).parameters())
-            for pair in ((self.actor_target, self.critic_target), (self.actor, self.critic))
-        )
-        self.trains_in_bfloat16 = shape.trains_in_bfloat16
+        self.targets: list[Tensor] = list(torch.nn.ModuleList([self.actor_target, self.critic_target]).parameters())
+        self.followed: list[Tensor] = list(torch.nn.ModuleList([self.actor, self.critic]).parameters())
         self.make_optimizers(lr_schedule(1.0))
 
     def make_optimizers(self, learning_rate: float) -> None:
         """New optimizers; the context belongs to the critics' one, and is trained by both losses."""
         ours = self.actor.head if self.shares_encoder else self.actor
-        self.actor_optimizer = Adam(ours.parameters(), learning_rate)
-        self.critic_optimizer = Adam([*self.critic.parameters(), *self.context.parameters()], learning_rate)
+        critics = [*self.critic.parameters(), *self.context.parameters()]
+        self.actor_optimizer = torch.optim.Adam(ours.parameters(), learning_rate, fused=True)
+        self.critic_optimizer = torch.optim.Adam(critics, learning_rate, fused=True)
 
     def adapted_parameters(self) -> list[torch.nn.Parameter]:
         """What learning changes: actor, critics and context, each once."""
@@ -94,32 +91,53 @@ class MQLPolicy(BasePolicy):
             for p in optimizer.param_groups[0]["params"]
         ]
 
-    def steps(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """What the context encoder reads: (length, n, inputs), and which steps there were, (length, n)."""
-        steps, valid = (to_tensor(values, self.device) for values in (windows.steps, windows.valid))
+    def steps(self, windows: Windows) -> Tensor:
+        """Return what the context encoder reads of windows, (length, n, inputs)."""
         if not self.shares_encoder and tuple(windows.columns) == self.window_terms:
-            return steps, valid
+            return windows.steps
         embed = self.critic.encoder.encoders if self.shares_encoder else {}
-        rows = steps.flatten(0, 1)  # whose columns a layer reads where they are
+        rows = windows.steps.flatten(0, 1)
         terms = {name: rows[:, windows.columns[name]] for name in self.window_terms}
         read = [embed[name](term) if name in embed else term for name, term in terms.items()]
-        return torch.cat([rows[:, : self._actions], *read], -1).unflatten(0, valid.shape), valid
+        return torch.cat([rows[:, : self._actions], *read], -1).unflatten(0, windows.valid.shape)
 
     def encode(self, windows: Windows) -> Tensor:
-        """The context z (n, hidden) at the end of each window."""
+        """Return the context z (n, hidden) at the end of each window."""
         if not self.uses_context:
             return torch.zeros(windows.valid.shape[1], self.context.hidden, device=self.device)
-        steps, valid = self.steps(windows)
-        return self.context(steps, valid, len(steps))[0]
+        windows = windows.to(self.device)
+        return self.context(self.steps(windows), windows.valid)
+
+    def contexts(self, windows: Windows, later: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the context z (n, hidden) of two windows that share rows, which are embedded once.
+
+        Args:
+            windows: of more than `history` rows.
+            later: int64 (n,) the row where the second window begins; the first one begins at row 0.
+
+        Returns:
+            z of the first window, and that of the second, without gradient.
+        """
+        if not self.uses_context:
+            zero = self.encode(windows)
+            return zero, zero
+        steps, length = self.steps(windows), self.history
+        context = self.context(steps[:length], windows.valid[:length])
+        with torch.no_grad():
+            arrival = (windows_from(rows, later, length) for rows in (steps, windows.valid))
+            return context, self.context(*arrival)
 
     def act(self, observation: Mapping[str, np.ndarray], windows: Windows) -> np.ndarray:
         """Actions in [-1, 1], (n, actions), without noise."""
         with torch.no_grad():
-            seen = {name: to_tensor(observation[name], self.device) for name in self.actor.encoder.encoders}
+            seen = {
+                name: torch.as_tensor(observation[name], dtype=torch.float32, device=self.device)
+                for name in self.actor.encoder.encoders
+            }
             return self.actor(self.actor.encoder(seen), self.encode(windows)).cpu().numpy()
 
     def explore(
-        self, observation: Mapping[str, np.ndarray], history: HistoryBuffer, noise: float, rng: np.random.Generator
+        self, observation: Mapping[str, np.ndarray], history: ReplayBuffer, noise: float, rng: np.random.Generator
     ) -> np.ndarray:
         """Actions in [-1, 1] with Gaussian noise of a standard deviation, float32 (n, actions).
 
@@ -178,9 +196,9 @@ class MQLPolicy(BasePolicy):
         with torch.no_grad():
             return self.encode(history.windows(history.latest, self.history, self.window_terms)).cpu().numpy()
 
-    def _new_history(self, n: int) -> HistoryBuffer:
+    def _new_history(self, n: int) -> ReplayBuffer:
         spaces = {name: box for name, box in self._spaces.items() if name in self.window_terms}
-        return HistoryBuffer((self.history + 2) * n, gym.spaces.Dict(spaces), self._actions, n)
+        return ReplayBuffer((self.history + 2) * n, gym.spaces.Dict(spaces), self._actions, n)
 
     def forward(self, observation: Any, deterministic: bool = True) -> Tensor:
         return self._predict(observation, deterministic)
@@ -195,8 +213,3 @@ class MQLPolicy(BasePolicy):
             preset=self.preset, history=self.history, uses_reward=self.uses_reward, uses_context=self.uses_context,
         )  # fmt: skip
         return data
-
-
-def to_tensor(values: np.ndarray, device: torch.device) -> Tensor:
-    """As float32 on a device."""
-    return torch.as_tensor(values).to(device, torch.float32)

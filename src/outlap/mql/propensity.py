@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
+from pydantic import Field
 
+from outlap.config import Config
 from outlap.errors import OutlapError
 
 LARGEST_EXPONENT = 30.0  # β stays finite in float32, squared and summed
@@ -70,21 +72,18 @@ def effective_sample_size(beta: np.ndarray) -> float:
     return float(beta.sum() ** 2 / (len(beta) * np.square(beta).sum()))
 
 
-class ClipRule(Protocol):
-    """Limits the weights of one minibatch after the other; new for every adaptation."""
-
-    def start(self) -> ClipState: ...
-
-
 class ClipState(Protocol):
+    """Limits the weights of one minibatch after the other during one adaptation."""
+
     def clip(self, beta: np.ndarray) -> tuple[np.ndarray, float]:
-        """The clipped weights (n,), and the level that they were clipped at; infinity where nothing is."""
+        """Return the clipped weights (n,), and the level that they were clipped at; infinity where nothing is."""
         ...
 
 
-@dataclass(frozen=True)
-class NoClip:
+class NoClip(Config):
     """Weights as they are."""
+
+    rule: Literal["none"] = "none"
 
     def start(self) -> NoClip:
         return self
@@ -94,11 +93,11 @@ class NoClip:
         return beta, math.inf
 
 
-@dataclass(frozen=True)
-class FixedClip:
+class FixedClip(Config):
     """The original's: f ≥ -bound, so that β ≤ exp(bound)."""
 
-    bound: float = 1.5
+    rule: Literal["fixed"] = "fixed"
+    bound: float = Field(default=1.5, ge=0)
 
     def start(self) -> FixedClip:
         return self
@@ -109,15 +108,15 @@ class FixedClip:
         return np.minimum(beta, level), level
 
 
-@dataclass(frozen=True)
-class AdaptiveBetaClip:
+class AdaptiveBetaClip(Config):
     """The paper's ABC: β ≤ μ_t + k σ_t, running mean and standard deviation over minibatches.
 
     μ_t = m μ_{t-1} + (1 - m) μ_b, and σ_t likewise; the first minibatch begins them.
     """
 
-    k: float = 2.5
-    momentum: float = 0.9
+    rule: Literal["abc"] = "abc"
+    k: float = Field(default=2.5, ge=0)
+    momentum: float = Field(default=0.9, ge=0)
 
     def start(self) -> AdaptiveBetaClipState:
         return AdaptiveBetaClipState(self)

@@ -105,4 +105,6 @@ def begin_episodes(model: Any) -> None:
     model._last_episode_starts = np.ones(model.n_envs, bool)
     replay = getattr(model, "replay_buffer", None)
     if replay is not None:
-        replay.begin_all(model.env, model._last_obs)
+        from outlap.mql import collector
+
+        collector.begin_episodes(replay, model.env, model._last_obs)

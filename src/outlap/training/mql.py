@@ -9,6 +9,7 @@ from tyro.conf import arg
 
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
+from outlap.mql.config import TD3Config
 from outlap.training.config import RECENT_EPISODES, TrainingConfig
 from outlap.training.ppo import PPOConfig
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from outlap.mql.mql import MQL
 
 
-class MQLConfig(TrainingConfig):
+class MQLConfig(TrainingConfig, TD3Config):
     """A meta-training. The defaults are for two cores; `--preset paper` has the paper's networks."""
 
     policy_name = "MQLPolicy"
@@ -39,11 +40,6 @@ class MQLConfig(TrainingConfig):
     batch_size: int = Field(default=256, ge=2)
     updates_per_step: int = Field(default=2, ge=1)  # for every action of all worlds
     n_steps: int = Field(default=3, ge=1)  # of a return
-    tau: float = Field(default=0.005, gt=0, le=1)
-    exploration_noise: float = Field(default=0.1, ge=0)
-    policy_noise: float = Field(default=0.2, ge=0)
-    noise_clip: float = Field(default=0.5, ge=0)
-    policy_delay: int = Field(default=2, ge=1)
 
     @field_validator("env")
     @classmethod
@@ -70,15 +66,11 @@ class MQLConfig(TrainingConfig):
             "buffer_size": self.buffer_size,
             "learning_starts": self.learning_starts,
             "batch_size": self.batch_size,
-            "tau": self.tau,
             "gamma": self.gamma,
             "train_freq": 1,
             "gradient_steps": self.updates_per_step,
             "n_steps": self.n_steps,
-            "exploration_noise": self.exploration_noise,
-            "policy_noise": self.policy_noise,
-            "noise_clip": self.noise_clip,
-            "policy_delay": self.policy_delay,
+            "td3": TD3Config(**{name: getattr(self, name) for name in TD3Config.model_fields}),
             "stats_window_size": RECENT_EPISODES,
             "seed": self.seed,
             "device": self.device,

@@ -11,76 +11,82 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from numba import njit
-from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
 
 from outlap.errors import OutlapError, brief
 from outlap.files import replacing
-from outlap.mql.gather import gather, gather_side_by_side
 from outlap.mql.recent import Recent, grown
 
 NONE = -1  # serial of no row
+
+
+TaskName = str | int | None  # None where an environment names no task
 
 
 @dataclass(frozen=True)
 class Windows:
     """Sequences of rows, oldest first, as a network goes through them: step by step."""
 
-    steps: np.ndarray  # float32 (length, n, columns): the action that led to each row, then each term asked for
+    steps: Tensor  # float32 (length, n, columns): the action that led to each row, then each term asked for
     columns: dict[str, slice]  # of each term in `steps`
-    valid: np.ndarray  # bool (length, n): False before an episode's start, where all else is 0
+    valid: Tensor  # bool (length, n): False before an episode's start, where all else is 0
 
     @property
-    def action(self) -> np.ndarray:
+    def action(self) -> Tensor:
         """(length, n, actions) that led to each row; 0 at an episode's start."""
         ends = min((columns.start for columns in self.columns.values()), default=None)
         return self.steps[..., :ends]
 
     @property
-    def observation(self) -> dict[str, np.ndarray]:
+    def observation(self) -> dict[str, Tensor]:
         """(length, n, size) of each term."""
         return {name: self.steps[..., columns] for name, columns in self.columns.items()}
 
     def first(self, rows: int) -> Windows:
-        """The first `rows` rows of each."""
+        """Return the first `rows` rows of each window."""
         return Windows(self.steps[:rows], self.columns, self.valid[:rows])
+
+    def to(self, device: torch.device) -> Windows:
+        """Return the windows on a device."""
+        return Windows(self.steps.to(device), self.columns, self.valid.to(device))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions of `steps` steps each, with the memory that belongs to both of their ends."""
+    """Transitions of `steps` steps each, with the windows that belong to both of their ends."""
 
     serial: np.ndarray  # int64 (n,) of the rows that they depart from
-    task: np.ndarray  # int64 (n,) positions in `HistoryBuffer.tasks`
+    task: np.ndarray  # int64 (n,) positions in `ReplayBuffer.tasks`
     windows: Windows  # of history + n_steps rows: up to the departure, then onwards; the last row repeated at the end
-    observation: dict[str, np.ndarray]  # float32 (n, size) of every term, at the departure
-    next_observation: dict[str, np.ndarray]  # (n, size) at the arrival
-    action: np.ndarray  # float32 (n, actions) taken at the departure
-    reward: np.ndarray  # float32 (n,) discounted sum over the steps
-    discount: np.ndarray  # float32 (n,) of the arrival's value: γ^steps, 0 where the episode terminated there
-    steps: np.ndarray  # int64 (n,) 1 … n_steps; fewer at the end of an episode
+    observation: dict[str, Tensor]  # float32 (n, size) of every term, at the departure
+    next_observation: dict[str, Tensor]  # (n, size) at the arrival
+    action: Tensor  # float32 (n, actions) taken at the departure
+    reward: Tensor  # float32 (n,) discounted sum over the steps
+    discount: Tensor  # float32 (n,) of the arrival's value: γ^steps, 0 where the episode terminated there
+    steps: Tensor  # int64 (n,) 1 … n_steps; fewer at the end of an episode
+
+    def to(self, device: torch.device) -> Batch:
+        """Return the batch on a device."""
+        if device.type == "cpu":
+            return self
+        return replace(
+            self,
+            windows=self.windows.to(device),
+            observation={name: term.to(device) for name, term in self.observation.items()},
+            next_observation={name: term.to(device) for name, term in self.next_observation.items()},
+            **{name: getattr(self, name).to(device) for name in ("action", "reward", "discount", "steps")},
+        )
 
 
-TaskName = str | int | None  # None where an environment tells none
-TASK_KEYS = ("task", "track")  # of an `info`: the first that is there names the world's task
-
-
-def task_of(info: Mapping[str, Any]) -> TaskName:
-    """The task that an info tells; None where it tells none. Raises OutlapError for one that cannot be saved."""
-    task = next((info[key] for key in TASK_KEYS if key in info), None)
-    task = task.item() if isinstance(task, np.generic) else task
-    if not isinstance(task, TaskName):
-        raise OutlapError(f"replay: a world's task is {task!r:.60}; must be a string, a whole number or None")
-    return task
-
-
-class HistoryBuffer:
+class ReplayBuffer:
     """Flat storage of the steps of many worlds, and an index of the newest transitions of every task."""
 
     def __init__(
@@ -194,39 +200,6 @@ class HistoryBuffer:
         for number in np.unique(tasks):
             self._departures[number].extend(np.sort(before[tasks == number]))
 
-    def begin_all(self, env: VecEnv, observation: Mapping[str, np.ndarray]) -> None:
-        """Begin an episode in every world of an environment that was just reset."""
-        self.begin(np.arange(env.num_envs), observation, [task_of(info) for info in env.reset_infos])
-
-    def add_step(
-        self,
-        env: VecEnv,
-        observation: Mapping[str, np.ndarray],
-        action: np.ndarray,
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: Sequence[Mapping[str, Any]],
-    ) -> None:
-        """Add what a step of an environment returned; where an episode ended, begin the next.
-
-        Args:
-            env: that was stepped.
-            observation: (worlds, size) of each term, the next episode's first one where one ended.
-            action: (worlds, actions) in [-1, 1].
-            reward, dones, infos: as the environment returned them.
-        """
-        arrived = {name: np.array(value) for name, value in observation.items()}
-        terminated = np.zeros(len(dones), bool)
-        over = np.flatnonzero(dones)
-        for world in over.tolist():
-            for name, value in infos[world]["terminal_observation"].items():
-                arrived[name][world] = value
-            terminated[world] = not infos[world].get("TimeLimit.truncated", False)
-        self.add(np.arange(len(dones)), arrived, action, reward, terminated)
-        if len(over):
-            first = {name: value[over] for name, value in observation.items()}
-            self.begin(over, first, [task_of(env.reset_infos[world]) for world in over.tolist()])
-
     def sample(self, n: int, rng: np.random.Generator, *, by_task: bool = False) -> np.ndarray:
         """Draw transitions: serials int64 (n,) of the rows that they depart from, for `gather`.
 
@@ -272,18 +245,20 @@ class HistoryBuffer:
             terms: of the observation that the windows hold.
         """
         rows, steps, reward = self._positions(serial, history, n_steps, gamma)
-        first, last = rows[history - 1], rows[-1]
-        seen = gather(self.observation, np.concatenate([first, last]))
+        departure, arrival = rows[history - 1], rows[-1]
+        ends = torch.from_numpy(np.concatenate([departure, arrival]))
+        seen = {name: _select(column, ends) for name, column in self.observation.items()}
+        n = len(departure)
         return Batch(
             serial=np.asarray(serial),
-            task=self.task[first],
+            task=self.task[departure],
             windows=self._read(rows, terms),
-            observation={name: term[: len(first)] for name, term in seen.items()},
-            next_observation={name: term[len(first) :] for name, term in seen.items()},
-            action=self.action[rows[history]],
-            reward=reward,
-            discount=np.where(self.terminated[last], 0.0, gamma**steps).astype(np.float32),
-            steps=steps,
+            observation={name: term[:n] for name, term in seen.items()},
+            next_observation={name: term[n:] for name, term in seen.items()},
+            action=_select(self.action, torch.from_numpy(rows[history])),
+            reward=torch.from_numpy(reward),
+            discount=torch.from_numpy(np.where(self.terminated[arrival], 0.0, gamma**steps).astype(np.float32)),
+            steps=torch.from_numpy(steps),
         )
 
     def _positions(
@@ -294,10 +269,15 @@ class HistoryBuffer:
         return _trace(*given, self.oldest, history, n_steps, gamma)
 
     def _read(self, rows: np.ndarray, terms: Sequence[str]) -> Windows:
-        sources = {"": self.action, **{name: self.observation[name] for name in terms}}
-        steps, columns = gather_side_by_side(sources, rows.ravel())
-        columns.pop("")
-        return Windows(steps.reshape(*rows.shape, steps.shape[1]), columns, rows != NONE)
+        sources = [self.action, *(self.observation[name] for name in terms)]
+        ends = np.cumsum([source.shape[1] for source in sources]).tolist()
+        valid, index = torch.from_numpy(rows != NONE), torch.from_numpy(rows.clip(min=0).ravel())
+        steps = torch.empty(rows.size, ends[-1])
+        for source, end in zip(sources, ends, strict=True):
+            steps[:, end - source.shape[1] : end] = _select(source, index)
+        steps.masked_fill_(~valid.view(-1, 1), 0.0)
+        columns = {name: slice(*place) for name, place in zip(terms, pairwise(ends), strict=True)}
+        return Windows(steps.view(*rows.shape, ends[-1]), columns, valid)
 
     def _add(self, worlds, observation, action, reward, terminated, before, tasks) -> None:
         serial = self.added + np.arange(len(worlds))
@@ -344,7 +324,7 @@ class HistoryBuffer:
                 raise ValueError(f"observation/{name} is {column.dtype} with {column.ndim} axes")
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> HistoryBuffer:
+    def load(cls, path: str | os.PathLike[str]) -> ReplayBuffer:
         """Read what `save` wrote; runs no code from the file. Raises OutlapError where it is missing or broken."""
         try:
             with np.load(path, allow_pickle=False) as file:
@@ -367,11 +347,8 @@ class HistoryBuffer:
             buffer._departures = []
             for number, (added, ascending) in enumerate(facts["departures"]):
                 recent = Recent(buffer.task_capacity)
-                recent.ring, recent.added, recent.ascending = (
-                    arrays[f"departures/{number}"],
-                    int(added),
-                    bool(ascending),
-                )
+                recent.ring = arrays[f"departures/{number}"]
+                recent.added, recent.ascending = int(added), bool(ascending)
                 buffer._departures.append(recent)
         except Exception as error:  # whatever a broken archive raises
             raise OutlapError(f"{path}: cannot be read as a replay: {brief(error)}") from error
@@ -382,6 +359,11 @@ ROW_FIELDS = {  # type of number and axes
     "action": (np.float32, 2), "reward": (np.float32, 1), "terminated": (np.bool_, 1),
     "before": (np.int64, 1), "after": (np.int64, 1), "task": (np.int64, 1),
 }  # fmt: skip
+
+
+def _select(column: np.ndarray, rows: Tensor) -> Tensor:
+    """Copy rows of a column, as float32."""
+    return torch.from_numpy(column).index_select(0, rows).float()
 
 
 @njit(cache=True)

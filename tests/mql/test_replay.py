@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,10 +11,12 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.errors import OutlapError
-from outlap.mql.buffers import Batch, HistoryBuffer, TaskName, Windows, task_of
+from outlap.mql.collector import add_step, begin_episodes, task_of
+from outlap.mql.replay import Batch, ReplayBuffer, TaskName, Windows
 
 VEL = gym.spaces.Dict({"vel": gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)})
 FIELDS = ("action", "reward", "terminated", "before", "after", "task")
@@ -28,12 +30,12 @@ def vel(*values: float) -> dict[str, np.ndarray]:
     return {"vel": np.array(values, np.float32)[:, None]}
 
 
-def begin(buffer: HistoryBuffer, worlds: Sequence[int], values: Sequence[float], tasks: Sequence[TaskName]) -> None:
+def begin(buffer: ReplayBuffer, worlds: Sequence[int], values: Sequence[float], tasks: Sequence[TaskName]) -> None:
     buffer.begin(np.array(worlds, int), vel(*values), tasks)
 
 
 def add(
-    buffer: HistoryBuffer,
+    buffer: ReplayBuffer,
     worlds: Sequence[int],
     values: Sequence[float],
     rewards: Sequence[float],
@@ -42,6 +44,23 @@ def add(
     """Rows whose action is a hundredth of their `vel`; `terminated` names worlds."""
     action = np.array(values)[:, None] / 100.0
     buffer.add(np.array(worlds), vel(*values), action, np.array(rewards), np.isin(worlds, terminated))
+
+
+def in_numpy(read: Any) -> Any:
+    """What was read, with an array for each tensor."""
+    if isinstance(read, torch.Tensor):
+        return read.numpy()
+    if isinstance(read, Windows | Batch):
+        return replace(read, **{each.name: in_numpy(getattr(read, each.name)) for each in fields(read)})
+    return {name: in_numpy(value) for name, value in read.items()} if isinstance(read, dict) else read
+
+
+def gather(buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> Any:
+    return in_numpy(buffer.gather(*args, **kwargs))
+
+
+def windows_of(buffer: ReplayBuffer, *args: Any) -> Any:
+    return in_numpy(buffer.windows(*args))
 
 
 # By hand. Serials, with world 0's rows on the left:
@@ -55,8 +74,8 @@ def add(
 #   step 6 14: 23  (r 32) 15: 61  (r 7)
 
 
-def by_hand(capacity: int = 100) -> HistoryBuffer:
-    buffer = HistoryBuffer(capacity, VEL, 1, 2)
+def by_hand(capacity: int = 100) -> ReplayBuffer:
+    buffer = ReplayBuffer(capacity, VEL, 1, 2)
     begin(buffer, [0, 1], [10, 50], ["left", "right"])
     add(buffer, [0, 1], [11, 51], [1, 1])
     add(buffer, [0, 1], [12, 52], [2, 10])
@@ -93,7 +112,7 @@ def test_what_is_drawn_are_the_rows_that_have_a_row_after_them() -> None:
 
 
 def test_windows_are_padded_before_an_episode_begins() -> None:
-    windows = by_hand().windows(np.array([0, 2, 6, 8, 9, 14, 12]), 3, ["vel"])
+    windows = windows_of(by_hand(), np.array([0, 2, 6, 8, 9, 14, 12]), 3, ["vel"])
     assert windows.observation["vel"][:, :, 0].T.tolist() == [
         [0, 0, 10],
         [0, 10, 11],
@@ -128,23 +147,23 @@ def test_windows_are_padded_before_an_episode_begins() -> None:
 
 
 def test_the_window_of_a_world_without_an_episode_is_empty() -> None:
-    buffer = HistoryBuffer(100, VEL, 1, 2)
+    buffer = ReplayBuffer(100, VEL, 1, 2)
     begin(buffer, [1], [5], ["task"])
-    windows = buffer.windows(buffer.latest, 2, ["vel"])
+    windows = windows_of(buffer, buffer.latest, 2, ["vel"])
     assert windows.valid.T.tolist() == [[False, False], [False, True]]
     assert windows.observation["vel"][:, :, 0].T.tolist() == [[0, 0], [0, 5]]
 
 
 def test_windows_hold_the_terms_that_are_asked_for() -> None:
-    buffer = HistoryBuffer(100, space(vel=1, heading=2, pose=3), 1, 1)
+    buffer = ReplayBuffer(100, space(vel=1, heading=2, pose=3), 1, 1)
     first = {"vel": np.ones((1, 1)), "heading": np.ones((1, 2)), "pose": np.ones((1, 3))}
     buffer.begin(np.array([0]), first, ["task"])
-    windows = buffer.windows(np.array([0]), 4, ["pose", "vel"])
+    windows = windows_of(buffer, np.array([0]), 4, ["pose", "vel"])
     assert {name: values.shape for name, values in windows.observation.items()} == {"pose": (4, 1, 3), "vel": (4, 1, 1)}
 
 
 def test_the_first_rows_of_windows() -> None:
-    first = by_hand().windows(np.array([2, 14]), 3, ["vel"]).first(2)
+    first = windows_of(by_hand(), np.array([2, 14]), 3, ["vel"]).first(2)
     assert first.observation["vel"][:, :, 0].T.tolist() == [[0, 10], [21, 22]]
     assert first.valid.T.tolist() == [[False, True], [True, True]]
     np.testing.assert_allclose(first.action[:, :, 0].T, [[0, 0], [0.21, 0.22]], rtol=1e-6)
@@ -152,7 +171,7 @@ def test_the_first_rows_of_windows() -> None:
 
 def test_transitions_of_one_step() -> None:
     # From 10 and from 50; into the terminated 13; into 55, which is cut short; into the newest row 23.
-    batch = by_hand().gather(np.array([0, 1, 4, 10, 11]), history=2, n_steps=1, gamma=0.5, terms=["vel"])
+    batch = gather(by_hand(), np.array([0, 1, 4, 10, 11]), history=2, n_steps=1, gamma=0.5, terms=["vel"])
     assert batch.serial.tolist() == [0, 1, 4, 10, 11]
     assert batch.task.tolist() == [0, 1, 0, 1, 1]
     assert batch.reward.tolist() == [1, 1, 4, 10000, 32]
@@ -187,7 +206,7 @@ BY_HAND_IN_THREE_STEPS = {
 
 def test_transitions_of_three_steps_are_shorter_where_the_episode_ends() -> None:
     serial = np.array(list(BY_HAND_IN_THREE_STEPS))
-    batch = by_hand().gather(serial, history=2, n_steps=3, gamma=0.5, terms=["vel"])
+    batch = gather(by_hand(), serial, history=2, n_steps=3, gamma=0.5, terms=["vel"])
     reward, discount, steps, arrival = zip(*BY_HAND_IN_THREE_STEPS.values(), strict=True)
     assert batch.reward.tolist() == list(reward)
     assert batch.discount.tolist() == list(discount)
@@ -197,7 +216,7 @@ def test_transitions_of_three_steps_are_shorter_where_the_episode_ends() -> None
 
 
 def test_windows_of_three_steps_repeat_the_last_row_where_the_episode_ends() -> None:
-    batch = by_hand().gather(np.array([0, 2, 4, 8, 9, 13]), history=3, n_steps=3, gamma=0.5, terms=["vel"])
+    batch = gather(by_hand(), np.array([0, 2, 4, 8, 9, 13]), history=3, n_steps=3, gamma=0.5, terms=["vel"])
     assert batch.windows.observation["vel"][:, :, 0].T.tolist() == [
         [0, 0, 10, 11, 12, 13],
         [0, 10, 11, 12, 13, 13],
@@ -213,7 +232,7 @@ def test_windows_of_three_steps_repeat_the_last_row_where_the_episode_ends() -> 
 @pytest.mark.parametrize("n_steps", [1, 2, 3, 5])
 def test_a_window_holds_the_departure_and_the_arrival_where_it_says(n_steps: int) -> None:
     buffer, history = by_hand(), 3
-    batch = buffer.gather(np.array(DEPARTURES), history=history, n_steps=n_steps, gamma=0.5, terms=["vel"])
+    batch = gather(buffer, np.array(DEPARTURES), history=history, n_steps=n_steps, gamma=0.5, terms=["vel"])
     held, each = batch.windows.observation["vel"], np.arange(len(DEPARTURES))
     assert held.shape == (history + n_steps, len(DEPARTURES), 1)
     expected = [10, 50, 11, 51, 12, 52, 53, 20, 21, 54, 22, 60]
@@ -221,21 +240,21 @@ def test_a_window_holds_the_departure_and_the_arrival_where_it_says(n_steps: int
     np.testing.assert_array_equal(held[history - 1 + batch.steps, each], batch.next_observation["vel"])
     # The window that ends at the arrival is that of the arrival itself.
     arrivals = [serial_of(buffer, value) for value in batch.next_observation["vel"][:, 0]]
-    ends = buffer.windows(np.array(arrivals), history, ["vel"])
+    ends = windows_of(buffer, np.array(arrivals), history, ["vel"])
     cut = batch.steps + np.arange(history)[:, None]
     np.testing.assert_array_equal(held[cut, each], ends.observation["vel"])
     np.testing.assert_array_equal(batch.windows.valid[cut, each], ends.valid)
 
 
-def serial_of(buffer: HistoryBuffer, value: float) -> int:
+def serial_of(buffer: ReplayBuffer, value: float) -> int:
     (serial,) = np.flatnonzero(buffer.observation["vel"][:, 0] == value)
     return int(serial)
 
 
 def test_both_observations_are_the_same_whether_or_not_a_window_holds_the_term() -> None:
     buffer = by_hand()
-    within = buffer.gather(np.array(DEPARTURES), history=2, n_steps=2, terms=["vel"])
-    without = buffer.gather(np.array(DEPARTURES), history=2, n_steps=2)
+    within = gather(buffer, np.array(DEPARTURES), history=2, n_steps=2, terms=["vel"])
+    without = gather(buffer, np.array(DEPARTURES), history=2, n_steps=2)
     assert without.windows.observation == {}
     for one, other in ((within, without), (without, within)):
         np.testing.assert_array_equal(one.observation["vel"], other.observation["vel"])
@@ -246,7 +265,7 @@ def test_a_window_ends_where_older_rows_are_gone() -> None:
     buffer = by_hand(capacity=8)  # keeps serials 8 … 15
     assert (buffer.oldest, buffer.transitions()) == (8, 5)
     assert np.unique(buffer.sample(500, np.random.default_rng(0))).tolist() == [8, 9, 10, 11, 13]
-    windows = buffer.windows(np.array([10, 12]), 3, ["vel"])  # 53 was serial 7
+    windows = windows_of(buffer, np.array([10, 12]), 3, ["vel"])  # 53 was serial 7
     assert windows.observation["vel"][:, :, 0].T.tolist() == [[0, 0, 54], [0, 54, 55]]
     assert windows.valid.T.tolist() == [[False, False, True], [False, True, True]]
 
@@ -294,7 +313,7 @@ class Lists:
 class Stream:
     """Random episodes in many worlds, into a buffer and into lists; each world takes part in a share of the steps."""
 
-    def __init__(self, buffer: HistoryBuffer, tasks: int, end: float, seed: int, share: float = 1.0) -> None:
+    def __init__(self, buffer: ReplayBuffer, tasks: int, end: float, seed: int, share: float = 1.0) -> None:
         self.share = share
         self.buffer, self.lists, self.tasks, self.end = buffer, Lists(), tasks, end
         self.rng = np.random.default_rng(seed)
@@ -346,7 +365,7 @@ def check_windows(windows: Windows, expected: list[list[Row]], length: int) -> N
         np.testing.assert_array_equal(windows.action[padding:length, i], [row.action for row in rows])
 
 
-def check_batch(batch: Batch, lists: Lists, buffer: HistoryBuffer, history: int, n_steps: int, gamma: float) -> None:
+def check_batch(batch: Batch, lists: Lists, buffer: ReplayBuffer, history: int, n_steps: int, gamma: float) -> None:
     check_windows(
         batch.windows, [lists.window(lists.rows[s], history, buffer.oldest) for s in batch.serial.tolist()], history
     )
@@ -382,7 +401,7 @@ def check_batch(batch: Batch, lists: Lists, buffer: HistoryBuffer, history: int,
 def test_random_streams_are_read_as_lists_of_episodes_are(
     worlds: int, capacity: int, tasks: int, end: float, steps: int, history: int, n_steps: int, share: float
 ) -> None:
-    buffer = HistoryBuffer(capacity, space(vel=1, scan=3), 2, worlds)
+    buffer = ReplayBuffer(capacity, space(vel=1, scan=3), 2, worlds)
     stream, rng = Stream(buffer, tasks, end, capacity, share), np.random.default_rng(1)
     for step in range(1, steps + 1):
         stream.step()
@@ -397,18 +416,18 @@ def test_random_streams_are_read_as_lists_of_episodes_are(
             for by_task in (False, True):
                 serial = buffer.sample(20, rng, by_task=by_task)
                 assert set(serial.tolist()) <= {row.serial for row in departures}
-                batch = buffer.gather(serial, history=history, n_steps=n_steps, gamma=0.9, terms=["scan", "vel"])
+                batch = gather(buffer, serial, history=history, n_steps=n_steps, gamma=0.9, terms=["scan", "vel"])
                 check_batch(batch, lists, buffer, history, n_steps, 0.9)
             ends = [lists.episodes[episode][-1] for episode in stream.episode_of]
             assert buffer.latest.tolist() == [row.serial for row in ends]
             kept = [row for row in ends if row.serial >= oldest]
-            newest = buffer.windows(np.array([row.serial for row in kept]), history, ["scan", "vel"])
+            newest = windows_of(buffer, np.array([row.serial for row in kept]), history, ["scan", "vel"])
             check_windows(newest, [lists.window(row, history, oldest) for row in kept], history)
 
 
 @pytest.mark.parametrize("capacity", [30, 10_000])
 def test_every_transition_that_is_kept_can_be_drawn(capacity: int) -> None:
-    buffer = HistoryBuffer(capacity, space(vel=1, scan=3), 2, 4)
+    buffer = ReplayBuffer(capacity, space(vel=1, scan=3), 2, 4)
     stream = Stream(buffer, tasks=3, end=0.2, seed=5)
     for _ in range(50):
         stream.step()
@@ -419,7 +438,7 @@ def test_every_transition_that_is_kept_can_be_drawn(capacity: int) -> None:
 
 
 def test_a_world_that_adds_less_often_than_another_leaves_the_drawing_sound() -> None:
-    buffer = HistoryBuffer(8, VEL, 1, 2)
+    buffer = ReplayBuffer(8, VEL, 1, 2)
     begin(buffer, [0, 1], [0, 1], ["task", "task"])
     for world in [0] * 6 + [1, 0]:
         add(buffer, [world], [9], [0])
@@ -428,7 +447,7 @@ def test_a_world_that_adds_less_often_than_another_leaves_the_drawing_sound() ->
 
 
 def test_a_world_keeps_its_task_when_its_newest_row_is_gone() -> None:
-    buffer = HistoryBuffer(8, VEL, 1, 2)
+    buffer = ReplayBuffer(8, VEL, 1, 2)
     begin(buffer, [0, 1], [0, 1], ["a", "b"])
     for world in [0] * 8 + [1]:
         add(buffer, [world], [9], [0])
@@ -436,15 +455,15 @@ def test_a_world_keeps_its_task_when_its_newest_row_is_gone() -> None:
 
 
 def test_a_row_whose_row_before_is_gone_is_linked_to_no_other() -> None:
-    buffer = HistoryBuffer(8, VEL, 1, 2)
+    buffer = ReplayBuffer(8, VEL, 1, 2)
     begin(buffer, [0, 1], [0, 1], ["a", "a"])
     for value in range(2, 10):
         add(buffer, [0], [value], [1])
     add(buffer, [1], [99], [1])  # serial 10; that of its row before was 1, where 9 is now
-    batch = buffer.gather(np.array([8]), history=1, n_steps=2, gamma=0.5, terms=["vel"])
+    batch = gather(buffer, np.array([8]), history=1, n_steps=2, gamma=0.5, terms=["vel"])
     assert batch.windows.observation["vel"][:, 0, 0].tolist() == [8, 9, 9]
     assert (batch.steps[0], batch.reward[0]) == (1, 1)
-    windows = buffer.windows(np.array([10]), 2, ["vel"])
+    windows = windows_of(buffer, np.array([10]), 2, ["vel"])
     assert windows.observation["vel"][:, 0, 0].tolist() == [0, 99]
     assert windows.valid[:, 0].tolist() == [False, True]
 
@@ -452,9 +471,9 @@ def test_a_row_whose_row_before_is_gone_is_linked_to_no_other() -> None:
 # Which tasks are drawn.
 
 
-def of_unequal_tasks(counts: Sequence[int], task_capacity: int | None = None) -> HistoryBuffer:
+def of_unequal_tasks(counts: Sequence[int], task_capacity: int | None = None) -> ReplayBuffer:
     """One world, an episode of `counts[i]` transitions of task i."""
-    buffer = HistoryBuffer(10_000, VEL, 1, 1, task_capacity=task_capacity)
+    buffer = ReplayBuffer(10_000, VEL, 1, 1, task_capacity=task_capacity)
     for task, count in enumerate(counts):
         begin(buffer, [0], [0], [task])
         for i in range(count):
@@ -487,7 +506,7 @@ def test_otherwise_every_transition_is_drawn_as_often() -> None:
 
 
 def test_a_task_of_which_nothing_is_left_is_not_drawn() -> None:
-    buffer = HistoryBuffer(50, VEL, 1, 1)
+    buffer = ReplayBuffer(50, VEL, 1, 1)
     for task in ("gone", "kept"):
         begin(buffer, [0], [0], [task])
         for i in range(100):
@@ -507,7 +526,7 @@ def test_the_task_capacity_limits_what_is_drawn_to_the_newest() -> None:
 
 
 def test_the_task_capacity_holds_when_rows_come_many_at_a_time() -> None:
-    buffer = HistoryBuffer(10_000, VEL, 1, 150, task_capacity=100)
+    buffer = ReplayBuffer(10_000, VEL, 1, 150, task_capacity=100)
     worlds = range(150)
     begin(buffer, worlds, worlds, ["task"] * 150)
     for _ in range(2):
@@ -535,12 +554,12 @@ def test_the_same_generator_draws_the_same() -> None:
 @pytest.mark.parametrize("capacity", [40, 10_000])
 def test_a_saved_buffer_goes_on_as_if_nothing_had_been(capacity: int, share: float, tmp_path: Path) -> None:
     """Saved before it is full, or after it was full many times."""
-    one, other = (HistoryBuffer(capacity, space(vel=1, scan=3), 2, 4, task_capacity=70) for _ in range(2))
+    one, other = (ReplayBuffer(capacity, space(vel=1, scan=3), 2, 4, task_capacity=70) for _ in range(2))
     streams = [Stream(buffer, 3, 0.1, 8, share) for buffer in (one, other)]
     for _ in range(60):
         streams[0].step()
         streams[1].step()
-    loaded = HistoryBuffer.load(other.save(tmp_path / "replay.npz"))
+    loaded = ReplayBuffer.load(other.save(tmp_path / "replay.npz"))
     streams[1].buffer = loaded
     assert (loaded.capacity, loaded.task_capacity, loaded.num_worlds) == (capacity, 70, 4)
     for _ in range(60):
@@ -549,7 +568,7 @@ def test_a_saved_buffer_goes_on_as_if_nothing_had_been(capacity: int, share: flo
             assert loaded.transitions(task) == one.transitions(task)
         serial, again = (buffer.sample(30, np.random.default_rng(0), by_task=True) for buffer in (one, loaded))
         np.testing.assert_array_equal(serial, again)
-        same_batch(*(buffer.gather(serial, history=5, n_steps=2, terms=["scan"]) for buffer in (one, loaded)))
+        same_batch(*(gather(buffer, serial, history=5, n_steps=2, terms=["scan"]) for buffer in (one, loaded)))
         streams[0].step()
         streams[1].step()
     assert loaded.observation.keys() == one.observation.keys()
@@ -558,8 +577,8 @@ def test_a_saved_buffer_goes_on_as_if_nothing_had_been(capacity: int, share: flo
         assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
         used = min(one.added, capacity)
         np.testing.assert_array_equal(ours[:used], theirs[:used])
-    batch = loaded.gather(
-        loaded.sample(50, np.random.default_rng(1)), history=4, n_steps=3, gamma=0.9, terms=["scan", "vel"]
+    batch = gather(
+        loaded, loaded.sample(50, np.random.default_rng(1)), history=4, n_steps=3, gamma=0.9, terms=["scan", "vel"]
     )
     check_batch(batch, streams[1].lists, loaded, 4, 3, 0.9)
 
@@ -582,7 +601,7 @@ def same_batch(one: Batch, other: Batch) -> None:
 
 def test_saving_changes_nothing(tmp_path: Path) -> None:
     buffer = by_hand()
-    loaded = HistoryBuffer.load(buffer.save(tmp_path / "replay.npz"))
+    loaded = ReplayBuffer.load(buffer.save(tmp_path / "replay.npz"))
     add(loaded, [0, 1], [24, 62], [0, 0])
     assert (buffer.added, loaded.added) == (16, 18)
     assert (buffer.transitions(), loaded.transitions()) == (12, 14)
@@ -591,9 +610,9 @@ def test_saving_changes_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rows", [0, 1])
 def test_a_buffer_without_transitions_can_be_saved(rows: int, tmp_path: Path) -> None:
-    buffer = HistoryBuffer(200, VEL, 1, 1)
+    buffer = ReplayBuffer(200, VEL, 1, 1)
     begin(buffer, [0] * rows, [10] * rows, ["task"] * rows)
-    loaded = HistoryBuffer.load(buffer.save(tmp_path / "replay.npz"))
+    loaded = ReplayBuffer.load(buffer.save(tmp_path / "replay.npz"))
     assert (loaded.added, loaded.transitions(), loaded.tasks) == (rows, 0, ["task"] * rows)
     begin(loaded, [0], [10], ["task"])
     for i in range(100):  # more than there is place for at first
@@ -603,9 +622,9 @@ def test_a_buffer_without_transitions_can_be_saved(rows: int, tmp_path: Path) ->
 
 def test_tasks_are_loaded_as_what_they_were(tmp_path: Path) -> None:
     names: list[TaskName] = ["7", 7, None]
-    buffer = HistoryBuffer(100, VEL, 1, 3)
+    buffer = ReplayBuffer(100, VEL, 1, 3)
     begin(buffer, range(3), range(3), names)
-    loaded = HistoryBuffer.load(buffer.save(tmp_path / "replay.npz"))
+    loaded = ReplayBuffer.load(buffer.save(tmp_path / "replay.npz"))
     assert loaded.tasks == names
     add(loaded, range(3), range(3), [0, 0, 0])
     add(loaded, [1], [5], [0])
@@ -627,14 +646,14 @@ RACE = {"scan": 540, "vel": 3, "heading": 2, "pose": 3}
 
 
 def test_a_nearly_empty_buffer_is_saved_small_however_much_it_may_hold(tmp_path: Path) -> None:
-    buffer = HistoryBuffer(1_000_000, space(**RACE), 2, 1)
+    buffer = ReplayBuffer(1_000_000, space(**RACE), 2, 1)
     seen = {name: np.ones((1, size)) for name, size in RACE.items()}
     buffer.begin(np.array([0]), seen, ["task"])
     for _ in range(9):
         buffer.add(np.array([0]), seen, np.ones((1, 2)), np.ones(1), np.zeros(1, bool))
     path = buffer.save(tmp_path / "replay.npz")
     assert path.stat().st_size < 20_000  # ten rows of 1.2 kB, and the rest
-    loaded = HistoryBuffer.load(path)
+    loaded = ReplayBuffer.load(path)
     assert loaded.observation["scan"].shape == (1_000_000, 540)
     assert loaded.transitions() == 9
 
@@ -643,7 +662,7 @@ def test_saving_takes_the_name_that_it_is_given_and_makes_the_folder(tmp_path: P
     path = tmp_path / "new" / "replay.partial"
     assert by_hand().save(str(path)) == path
     by_hand(capacity=8).save(path)  # over the one before
-    assert HistoryBuffer.load(str(path)).capacity == 8
+    assert ReplayBuffer.load(str(path)).capacity == 8
     assert [file.name for file in path.parent.iterdir()] == ["replay.partial"]
 
 
@@ -695,14 +714,14 @@ def test_what_is_no_replay_is_an_error_that_names_the_file(broken: str, tmp_path
     else:
         np.savez(path, **{**arrays, "task": np.array([object()])})  # type: ignore[arg-type]
     with pytest.raises(OutlapError, match=r"replay\.npz: cannot be read as a replay"):
-        HistoryBuffer.load(path)
+        ReplayBuffer.load(path)
 
 
 # What it is stored as.
 
 
 def test_a_million_rows_of_a_race_fit_into_three_gigabytes() -> None:
-    buffer = HistoryBuffer(1_000_000, space(**RACE), 2, 16)
+    buffer = ReplayBuffer(1_000_000, space(**RACE), 2, 16)
     columns = [value for value in vars(buffer).values() if isinstance(value, np.ndarray)]
     assert sum(column.nbytes for column in [*columns, *buffer.observation.values()]) < 3e9
     assert {name: column.shape for name, column in buffer.observation.items()} == {
@@ -713,12 +732,12 @@ def test_a_million_rows_of_a_race_fit_into_three_gigabytes() -> None:
 def test_scans_are_stored_in_half_precision_to_8_mm_and_the_rest_in_single() -> None:
     rng = np.random.default_rng(0)
     scan, velocity = rng.uniform(0.0, 30.0, (1, 540)).astype(np.float32), rng.normal(size=(1, 3)).astype(np.float32)
-    buffer = HistoryBuffer(10, space(scan=540, vel=3), 2, 1)
+    buffer = ReplayBuffer(10, space(scan=540, vel=3), 2, 1)
     buffer.begin(np.array([0]), {"scan": scan, "vel": velocity}, ["task"])
     buffer.add(np.array([0]), {"scan": scan / 2, "vel": velocity / 3}, np.ones((1, 2)), np.ones(1), np.zeros(1, bool))
     assert buffer.observation["scan"].dtype == np.float16
     assert buffer.observation["vel"].dtype == np.float32
-    windows = buffer.windows(np.array([1]), 2, ["scan", "vel"])
+    windows = windows_of(buffer, np.array([1]), 2, ["scan", "vel"])
     assert windows.steps.dtype == np.float32
     for term, expected in enumerate((scan[0], scan[0] / 2)):
         error = np.abs(windows.observation["scan"][term, 0].astype(np.float64) - expected)
@@ -728,18 +747,18 @@ def test_scans_are_stored_in_half_precision_to_8_mm_and_the_rest_in_single() -> 
 
 
 def test_other_terms_may_be_stored_in_half_precision() -> None:
-    buffer = HistoryBuffer(10, space(scan=4, vel=3), 2, 1, half_precision=["vel"])
+    buffer = ReplayBuffer(10, space(scan=4, vel=3), 2, 1, half_precision=["vel"])
     assert (buffer.observation["scan"].dtype, buffer.observation["vel"].dtype) == (np.float32, np.float16)
 
 
 def test_what_is_read_is_a_copy() -> None:
     buffer = by_hand()
-    batch = buffer.gather(np.array([4]), history=2, n_steps=1)
-    windows = buffer.windows(np.array([4]), 2, ["vel"])
+    batch = gather(buffer, np.array([4]), history=2, n_steps=1)
+    windows = windows_of(buffer, np.array([4]), 2, ["vel"])
     for values in (*batch.observation.values(), *batch.next_observation.values(), *windows.observation.values()):
         values[...] = 99.0
     windows.action[...] = batch.action[...] = 99.0
-    after = buffer.windows(np.array([4, 6]), 2, ["vel"])
+    after = windows_of(buffer, np.array([4, 6]), 2, ["vel"])
     assert after.observation["vel"][:, :, 0].T.tolist() == [[11, 12], [12, 13]]
     np.testing.assert_allclose(after.action[:, :, 0].T, [[0.11, 0.12], [0.12, 0.13]], rtol=1e-6)
 
@@ -748,7 +767,7 @@ def test_what_is_read_is_a_copy() -> None:
 
 
 def test_adding_before_an_episode_has_begun_is_an_error() -> None:
-    buffer = HistoryBuffer(100, VEL, 1, 2)
+    buffer = ReplayBuffer(100, VEL, 1, 2)
     with pytest.raises(OutlapError, match="call begin first"):
         add(buffer, [0], [1], [0])
     begin(buffer, [0], [1], ["task"])
@@ -759,13 +778,13 @@ def test_adding_before_an_episode_has_begun_is_an_error() -> None:
 
 def test_a_capacity_too_small_is_an_error() -> None:
     with pytest.raises(OutlapError, match="capacity is 11; 4 worlds need at least 12 rows"):
-        HistoryBuffer(11, VEL, 1, 4)
-    HistoryBuffer(12, VEL, 1, 4)
+        ReplayBuffer(11, VEL, 1, 4)
+    ReplayBuffer(12, VEL, 1, 4)
 
 
 @pytest.mark.parametrize("by_task", [False, True])
 def test_drawing_from_an_empty_buffer_is_an_error(by_task: bool) -> None:
-    buffer = HistoryBuffer(100, VEL, 1, 1)
+    buffer = ReplayBuffer(100, VEL, 1, 1)
     with pytest.raises(OutlapError, match="no transition yet"):
         buffer.sample(1, np.random.default_rng(0), by_task=by_task)
     begin(buffer, [0], [1], ["task"])  # a row, but nothing after it
@@ -787,8 +806,8 @@ def test_the_task_of_an_info_is_its_task_or_else_its_track() -> None:
 
 
 def test_a_step_that_ends_episodes_stores_where_they_ended_and_begins_the_next() -> None:
-    buffer = HistoryBuffer(100, VEL, 1, 4)
-    buffer.begin_all(fake_env({"track": "a"}, {"track": "b"}, {"track": "a"}, {"track": "c"}), vel(1, 2, 3, 4))
+    buffer = ReplayBuffer(100, VEL, 1, 4)
+    begin_episodes(buffer, fake_env({"track": "a"}, {"track": "b"}, {"track": "a"}, {"track": "c"}), vel(1, 2, 3, 4))
     assert buffer.tasks == ["a", "b", "c"]
     # World 0 terminates, 1 is cut short, 2 goes on, 3 terminates and says so.
     env = fake_env({"track": "d"}, {"track": "e"}, {"track": "not begun"}, {"track": "a"})
@@ -800,10 +819,10 @@ def test_a_step_that_ends_episodes_stores_where_they_ended_and_begins_the_next()
         {"terminal_observation": {"vel": np.array([40.0])}, "TimeLimit.truncated": False},
     ]
     action, reward = np.array([[0.1], [0.2], [0.3], [0.4]]), np.array([1.0, 2.0, 3.0, 4.0])
-    buffer.add_step(env, observation, action, reward, np.array([True, True, False, True]), infos)
+    add_step(buffer, env, observation, action, reward, np.array([True, True, False, True]), infos)
     np.testing.assert_array_equal(observation["vel"][:, 0], [100, 200, 30, 400])  # the caller's is untouched
 
-    batch = buffer.gather(np.arange(4), history=1, n_steps=1, gamma=0.5, terms=["vel"])
+    batch = gather(buffer, np.arange(4), history=1, n_steps=1, gamma=0.5, terms=["vel"])
     assert batch.observation["vel"][:, 0].tolist() == [1, 2, 3, 4]
     assert batch.next_observation["vel"][:, 0].tolist() == [10, 20, 30, 40]
     assert batch.discount.tolist() == [0.0, 0.5, 0.5, 0.0]
@@ -812,12 +831,12 @@ def test_a_step_that_ends_episodes_stores_where_they_ended_and_begins_the_next()
     assert [buffer.tasks[task] for task in batch.task] == ["a", "b", "a", "c"]
 
     assert buffer.added == 11  # three rows more, of the episodes that begin
-    newest = buffer.windows(buffer.latest, 2, ["vel"])
+    newest = windows_of(buffer, buffer.latest, 2, ["vel"])
     assert newest.observation["vel"][:, :, 0].T.tolist() == [[0, 100], [0, 200], [3, 30], [0, 400]]
     assert buffer.reward[buffer.latest].tolist() == [0, 0, 3, 0]
 
     quiet = fake_env(*[{"track": "not begun"}] * 4)
-    buffer.add_step(quiet, vel(101, 201, 31, 401), action, reward, np.zeros(4, bool), [{}] * 4)
+    add_step(buffer, quiet, vel(101, 201, 31, 401), action, reward, np.zeros(4, bool), [{}] * 4)
     assert buffer.added == 15
     assert buffer.tasks == ["a", "b", "c", "d", "e"]
     assert [buffer.transitions(task) for task in buffer.tasks] == [4, 1, 1, 1, 1]
