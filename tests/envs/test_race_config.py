@@ -27,8 +27,9 @@ def test_the_papers_vehicle(ellipse):
     }  # fmt: skip
     assert {name: vehicle[name] for name in expected} == expected
     _, info = env.reset(seed=0)
-    car = to_records(info["vehicle"][0, 0])[["mu", "a_max", "v_min", "v_max"]].item()
-    np.testing.assert_allclose(car, [0.8, 6.34, -8.0, 8.0], rtol=1e-6)
+    car = to_records(info["vehicle"][0, 0])
+    drawn = [float(car[name]) for name in ("mu", "a_max", "v_min", "v_max")]
+    np.testing.assert_allclose(drawn, [0.8, 6.34, -8.0, 8.0], rtol=1e-6)
 
 
 def test_a_preset_with_changes(ellipse):

@@ -190,14 +190,14 @@ def _scan(atlas, constants, worlds, w, c):
     yaw = float(state[column.YAW])
     x = state[column.X] + p.mount_x * math.cos(yaw)
     y = state[column.Y] + p.mount_x * math.sin(yaw)
-    beam_cos, beam_sin = constants.beam_cos, constants.beam_sin
-    cast_walls(atlas, worlds.track[w], x, y, yaw, beam_cos, beam_sin, p.max_range, scan)
+    beam_cos, beam_sin, max_range = constants.beam_cos, constants.beam_sin, p.max_range
+    cast_walls(atlas, worlds.track[w], x, y, yaw, beam_cos, beam_sin, max_range, scan)
     for other in range(worlds.state.shape[1]):
         if other == c or worlds.contact[w, other] == REMOVED:
             continue
         body, size = worlds.state[w, other], worlds.params[w, other]
         dx, dy = body[column.X] - x, body[column.Y] - y
-        reach = p.max_range + size.length
+        reach = max_range + size.length
         if dx * dx + dy * dy < reach * reach:
             cast_car(
                 x, y, yaw, beam_cos, beam_sin,
