@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from outlap.envs.race_config import RaceConfig
-from outlap.evaluation import rollout
+from outlap.evaluation import protocol, rollout
 from outlap.evaluation.metrics import summarise_methods
 from outlap.evaluation.recorder import record_episodes
 from outlap.evaluation.recording import RECORDINGS
@@ -80,7 +80,7 @@ class AdaptationUnit(Unit):
 
         folder, track = self.folder(work), load_track(self.track)
         policy = self._policy(folder, report)
-        env = rollout.standing_starts(self.env, [track], 0, self.races.time_limit)
+        env = protocol.standing_starts(self.env, [track], 0, self.races.time_limit)
         driver = PolicyDriver(policy, scale_observations=env.scale_observations, name=self.method)
         rows = rollout.evaluate(
             driver, env, [track], self.races.episodes, self.races.seed,
