@@ -63,7 +63,7 @@ def record_episode(
 
     Args:
         driver: of the first car.
-        env: the task, see `rollout.standing_starts`; its beams are recorded, even of a driver without a scanner.
+        env: the task, see `protocol.standing_starts`; its beams are recorded, even of a driver without a scanner.
             Rewards are those that the driver is shown.
         track: to race on.
         seed: of the episode: of a row of `evaluate`, for example.

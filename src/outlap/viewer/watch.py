@@ -40,7 +40,7 @@ class Watch:
 
         Args:
             driver: of the first car.
-            env: the task, see `rollout.standing_starts`.
+            env: the task, see `protocol.standing_starts`.
             track: to race on.
             seed: of the first episode; those after it go on from there.
             size: of the window (width, height) in pixels.
