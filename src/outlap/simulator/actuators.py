@@ -3,6 +3,9 @@
 Scalar functions of one car's parameters `p`, applied once per integrator step.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math

@@ -35,13 +35,14 @@ class Atlas(NamedTuple):
 
     words: np.ndarray  # uint32: WALL or clearance of all grids' cells, eight a word
     line: np.ndarray  # track.centerline.TABLE (rows,): the centreline tables of all tracks
-    index: np.ndarray  # int64 (tracks, 5): where each track lies in the two above
+    index: np.ndarray  # int64 (tracks, 5): where each track lies in those  # pyright: ignore[reportIncompatibleMethodOverride]
     frame: np.ndarray  # float64 (tracks, 6): grid origin [m] and yaw, cell size and row spacing [m]
 
 
 def build_atlas(tracks: Sequence[Track]) -> Atlas:
     """Pack tracks; the position of a track in `tracks` is its number in the kernels."""
-    words, lines = [], []
+    words: list[np.ndarray] = []
+    lines: list[np.ndarray] = []
     index = np.zeros((len(tracks), 5), dtype=np.int64)
     frame = np.zeros((len(tracks), 6))
     first_word = first_row = 0
@@ -76,14 +77,14 @@ def _pack_cells(track: Track) -> np.ndarray:
 
 
 @njit(cache=True)
-def cell_clearance(words, first_word, grid_width, col, row):
+def cell_clearance(words: np.ndarray, first_word: int, grid_width: int, col: int, row: int) -> np.int64:
     """The clearance of a cell [cells], or WALL; `col` and `row` count the ring and lie in the grid."""
     word = words[first_word + (row >> 3) * grid_width + col]
     return (np.int64(word) >> ((row & 7) << 2)) & 15
 
 
 @njit(cache=True)
-def to_grid(frame, track, x, y):
+def to_grid(frame: np.ndarray, track: int, x: float, y: float) -> tuple[float, float]:
     """Map frame [m] → (column, row) of a track's grid [cells], the ring counted."""
     x = x - frame[track, ORIGIN_X]
     y = y - frame[track, ORIGIN_Y]

@@ -10,6 +10,9 @@ centre of gravity. Where this departs from the published equations, on purpose:
 - An axle's load never falls below zero.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math

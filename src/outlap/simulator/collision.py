@@ -1,5 +1,8 @@
 """Contact of a car's true rectangle with walls and with other cars, by separating axes."""
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math

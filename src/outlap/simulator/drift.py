@@ -6,6 +6,9 @@ that a car that slides backwards loses energy; they are the published ones for a
 forward at 0.1 m/s or more.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math

@@ -9,6 +9,9 @@ inputs are within the car's limits (`actuators`) and constant over a step. No fu
 source compiles for CUDA.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math

@@ -5,6 +5,9 @@ Frenet coordinates: `s` [m] along the line from the start line, `d` [m] to its l
 `h` the spacing [m]. Between rows the curve is the cubic Hermite segment of the two positions and tangents.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math

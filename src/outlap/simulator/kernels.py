@@ -4,6 +4,9 @@ Each function takes the tracks (`Atlas`), the constants of a simulator (`Constan
 worlds (`Worlds`), which it changes in place. Nothing is allocated.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math
@@ -13,7 +16,7 @@ from numba import njit, prange
 
 from outlap.simulator import state as column
 from outlap.simulator.actuators import acceleration, delay_steps, lag, steering_rate
-from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
+from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, REMOVED, rectangles_overlap, touches_wall
 from outlap.simulator.dynamics import (
     KINEMATIC,
@@ -26,7 +29,7 @@ from outlap.simulator.dynamics import (
 from outlap.simulator.frenet import frenet_point, frenet_project
 from outlap.simulator.lidar import apply_sensor_noise, cast_car, cast_walls
 from outlap.simulator.seeding import hash64
-from outlap.simulator.worlds import ARC_LENGTH, HEADING_ERROR, OFFSET
+from outlap.simulator.worlds import ARC_LENGTH, HEADING_ERROR, OFFSET, Constants, Worlds
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -225,7 +228,7 @@ def _step_world(atlas, constants, worlds, w, commands, repeats):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def step_worlds(atlas, constants, worlds, commands, repeats):
+def step_worlds(atlas: Atlas, constants: Constants, worlds: Worlds, commands: np.ndarray, repeats: int) -> None:
     """Advance every world by `repeats` physics steps under constant commands, then scan.
 
     Args:
@@ -299,7 +302,16 @@ def _reset_world(atlas, constants, worlds, w, key, track, params, starts):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def reset_worlds(atlas, constants, worlds, which, keys, tracks, params, starts):
+def reset_worlds(
+    atlas: Atlas,
+    constants: Constants,
+    worlds: Worlds,
+    which: np.ndarray,
+    keys: np.ndarray,
+    tracks: np.ndarray,
+    params: np.ndarray,
+    starts: np.ndarray,
+) -> None:
     """Begin an episode in some worlds and scan.
 
     Args:
@@ -335,7 +347,7 @@ def _respawn(atlas, constants, worlds, w, c, clearance):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def respawn_cars(atlas, constants, worlds, clearance):
+def respawn_cars(atlas: Atlas, constants: Constants, worlds: Worlds, clearance: float) -> None:
     """Put removed cars back on the centreline where they left it, at rest.
 
     Args:

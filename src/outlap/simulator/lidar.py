@@ -9,6 +9,9 @@ groups take turns, so that the processor can work on one while it waits for the 
 has arrived makes room for the next.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math

@@ -22,7 +22,7 @@ def world_keys(seeds: Sequence[int]) -> np.ndarray:
 
 
 @njit(cache=True)
-def hash64(key, counter):
+def hash64(key: np.uint64, counter: np.uint64) -> np.uint64:
     """A 64-bit hash of (key, counter), both uint64."""
     z = key + (counter + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -31,7 +31,7 @@ def hash64(key, counter):
 
 
 @njit(cache=True)
-def _fill_uniform(keys, episodes, stream, out):
+def _fill_uniform(keys: np.ndarray, episodes: np.ndarray, stream: int, out: np.ndarray) -> None:
     for row in range(out.shape[0]):
         key = hash64(hash64(keys[row], np.uint64(episodes[row])), np.uint64(stream))
         for column in range(out.shape[1]):

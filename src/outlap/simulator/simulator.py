@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -81,7 +81,7 @@ class Simulator:
         cars = (num_worlds, num_cars)
         self._commands = np.zeros((*cars, 2), np.float32)
         self._started = np.zeros(num_worlds, bool)
-        self._called = set()  # kernels that have run
+        self._called: set[Callable[..., None]] = set()  # kernels that have run
         self.compile_seconds: float | None = None  # of the first call of each kernel, load from cache included
 
     def reset(
@@ -174,7 +174,7 @@ class Simulator:
         """
         self._timed(kernels.respawn_cars, self.atlas, self._constants, self.worlds, float(clearance))
 
-    def _timed(self, kernel, *arguments) -> None:
+    def _timed(self, kernel: Callable[..., None], *arguments: object) -> None:
         """Call a kernel; note how long its first call takes, which compiles it or loads it from the cache."""
         if kernel in self._called:
             kernel(*arguments)
@@ -201,7 +201,7 @@ def _check_rows(params: np.ndarray) -> None:
     low, high = accepted_bounds()
     accepted = (values >= low) & (values <= high)
     if not accepted.all():
-        world, car, column = np.argwhere(~accepted)[0]
+        world, car, column = (int(number) for number in np.argwhere(~accepted)[0])
         name, value = parameter_names()[column], values[world, car, column]
         raise OutlapError(
             f"simulator: params: {name} of car {car} in row {world} is {value:g}; "

@@ -6,6 +6,9 @@ section 9.2 and table 7: longitudinal slip is POSITIVE UNDER BRAKING, and the sl
 wheel's velocity seen from the wheel, left positive, so that p_ky1 < 0 makes the force oppose it.
 """
 
+# pyright: basic
+# Numba infers the types of kernels; annotations would repeat them and compile nothing.
+
 from __future__ import annotations
 
 import math
