@@ -1,4 +1,4 @@
-"""`outlap benchmark simulator`, `mql` and `racing`."""
+"""`outlap benchmark simulator` and `outlap benchmark mql`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from outlap.cli.command import Flag, LongCommand
+from outlap.cli.command import LongCommand
 from outlap.cli.output import CommandResult
 from outlap.errors import OutlapError
 from outlap.processes import in_new_process
@@ -267,86 +267,3 @@ def _print_mql(console: Console, rows: list[dict[str, Any]]) -> None:
             f"{row['env_steps_per_second']:,}",
         )
     console.print(table)
-
-
-@dataclass(frozen=True)
-class BenchmarkRacing(LongCommand):
-    """Measure races against opponents: actions of the first car per second, simulator and opponents together.
-
-    The first car holds random actions; its episode begins anew when it crashes, and the time for that counts.
-    """
-
-    opponents: tuple[str, ...] = ("population",)
-    """Drivers and populations; the training half of the one that comes with outlap by default."""
-
-    opponent_code: Flag = False
-    """Import modules for opponents, module:function, which runs their code."""
-
-    worlds: int = 128
-    """Races in lock-step."""
-
-    cars: int = 2
-    """In every race."""
-
-    beams: int = 108
-    """LiDAR beams."""
-
-    control_interval: int = 4
-    """Physics steps per action."""
-
-    tracks: tuple[str, ...] = ()
-    """Names or map folders; the built-in training circuits by default."""
-
-    seconds: float = 5.0
-    """Of a measurement."""
-
-    repeats: int = 3
-    """Measurements; the median is reported, with the fastest and the slowest."""
-
-    def run(self) -> CommandResult:
-        if self.worlds < 1 or self.cars < 2 or self.seconds <= 0 or self.repeats < 1:
-            raise OutlapError("--cars must be at least 2, --worlds and --repeats at least 1, and --seconds more than 0")
-        begun, expected = time.monotonic(), round((1 + self.repeats) * self.seconds)
-        with self.progress("benchmark", expected, "seconds") as update:
-            row = in_new_process(_measure_racing, self, on_wait=lambda: update(int(time.monotonic() - begun), ""))
-        data = {"rows": [row], "machine": machine()}
-        return CommandResult(data, lambda console: _print_racing(console, row))
-
-
-def _measure_racing(settings: BenchmarkRacing) -> dict[str, Any]:
-    import numpy as np
-
-    from outlap.envs.keywords import make_race_vector
-
-    env = make_race_vector(
-        settings.worlds, tracks=settings.tracks, num_cars=settings.cars, beams=settings.beams,
-        control_interval=settings.control_interval, opponents=settings.opponents, opponent_code=settings.opponent_code,
-        scale_observations=True, observation=("scan", "vel", "heading", "previous_action"), speed_range=(0.0, 8.0),
-    )  # fmt: skip
-    env.reset(seed=0)
-    plans = np.random.default_rng(0).uniform([-0.3, -1.0], [0.3, 0.5], (PLANS, settings.worlds, 2)).astype(np.float32)
-    rates = []
-    for repeat in range(1 + settings.repeats):  # the first one compiles
-        steps, begin = 0, time.perf_counter()
-        while time.perf_counter() - begin < settings.seconds:
-            env.step(plans[(steps // HOLD + repeat) % PLANS])
-            steps += 1
-        rates.append(steps * settings.worlds / (time.perf_counter() - begin))
-    return {
-        "cars": settings.cars,
-        "beams": settings.beams,
-        "worlds": settings.worlds,
-        "control_interval": settings.control_interval,
-        "opponents": [driver.name for driver in env.opponents.drivers],
-        "ego_steps_per_second": round(float(np.median(rates[1:]))),
-        "slowest_ego_steps_per_second": round(min(rates[1:])),
-        "fastest_ego_steps_per_second": round(max(rates[1:])),
-    }
-
-
-def _print_racing(console: Console, row: dict[str, Any]) -> None:
-    console.print(
-        f"{row['worlds']} races of {row['cars']} cars, {row['beams']} beams, {len(row['opponents'])} opponents to draw "
-        f"from: {row['ego_steps_per_second']:,} actions of the first car a second "
-        f"({row['slowest_ego_steps_per_second']:,} … {row['fastest_ego_steps_per_second']:,})",
-    )

@@ -69,10 +69,8 @@ COMMANDS = (
     Entry("plot learning", "outlap.cli.plot:PlotLearning", "draw learning curves of runs"),
     Entry("plot contexts", "outlap.cli.plot:PlotContexts", "draw how a policy's context tells tasks apart"),
     Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),
-    Entry("benchmark racing", "outlap.cli.benchmark:BenchmarkRacing", "measure races against opponents"),
     Entry("benchmark mql", "outlap.cli.benchmark:BenchmarkMQL", "measure updates of Meta-Q-Learning"),
     Entry("benchmark car", "outlap.cli.benchmark_car:BenchmarkCar", "measure an exported policy's latency"),
-    Entry("benchmark viewer", "outlap.cli.benchmark_viewer:BenchmarkViewer", "measure the window, videos and replays"),
     Entry("demo", "outlap.cli.demo:Demo", "meta-train, adapt and race on built-in circuits in a few minutes"),
 )
 
