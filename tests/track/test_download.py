@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,12 +20,11 @@ import pytest
 import outlap.track.download as download_module
 from outlap.errors import OutlapError
 from outlap.track import load_track
-from outlap.track.archive import ArchiveLimits
 from outlap.track.download import LOCK_FILE, DownloadedTrack, download_tracks
-from outlap.track.transfer import Patience, UnreachableError
+from outlap.track.transfer import DownloadLimits, UnreachableError
 from track_archives import LENGTH, ArchiveServer, Request, tar_xz, track_members
 
-QUICK = Patience(timeout=0.4, deadline=10.0, tries=3, backoff=0.01)
+QUICK = DownloadLimits(timeout=0.4, deadline=10.0, tries=3, backoff=0.01)
 
 
 @pytest.fixture
@@ -51,8 +51,8 @@ def archive(members: dict[str, bytes]) -> bytes:
     return tar_xz(members)
 
 
-def get(server: ArchiveServer, *names: str, patience: Patience = QUICK, **options) -> list[DownloadedTrack]:
-    return download_tracks(names, url_template=server.url_template, patience=patience, **options)
+def get(server: ArchiveServer, *names: str, limits: DownloadLimits = QUICK, **options) -> list[DownloadedTrack]:
+    return download_tracks(names, url_template=server.url_template, limits=limits, **options)
 
 
 def visible(cache: Path) -> list[str]:
@@ -117,9 +117,9 @@ def test_downloads_at_once_fetch_once(server, cache, archive):
         request.answer(archive)
 
     server.answers["/Circle.tar.xz"] = slowly
-    patience = Patience(timeout=5.0)
+    limits = DownloadLimits(timeout=5.0)
     with ThreadPoolExecutor(4) as pool:
-        results = list(pool.map(lambda _: get(server, "Circle", patience=patience)[0].status, range(4)))
+        results = list(pool.map(lambda _: get(server, "Circle", limits=limits)[0].status, range(4)))
     assert sorted(results) == ["downloaded", "present", "present", "present"]
     assert len(server.requested) == 1
     assert visible(cache) == ["Circle", LOCK_FILE]
@@ -173,7 +173,7 @@ def test_a_server_that_trickles_meets_the_deadline(server, cache, archive):
     server.answers["/Circle.tar.xz"] = lambda request: trickle(request, archive, server)
     started = time.monotonic()
     with pytest.raises(OutlapError, match=r"not complete after 0\.5 s"):
-        get(server, "Circle", patience=Patience(timeout=5.0, deadline=0.5))
+        get(server, "Circle", limits=DownloadLimits(timeout=5.0, deadline=0.5))
     assert time.monotonic() - started < 3
     assert visible(cache) == []
 
@@ -199,7 +199,7 @@ def test_offline(cache):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     with pytest.raises(UnreachableError, match=r"Monza.*: cannot reach 127.0.0.1:\d+ \(connection refused\)") as caught:
-        download_tracks(["Monza", "Spa"], url_template=f"http://127.0.0.1:{port}/{{name}}.tar.xz", patience=QUICK)
+        download_tracks(["Monza", "Spa"], url_template=f"http://127.0.0.1:{port}/{{name}}.tar.xz", limits=QUICK)
     assert "\n" not in str(caught.value)
 
 
@@ -207,7 +207,7 @@ def test_offline(cache):
 def test_only_https_is_allowed(url, cache, monkeypatch):
     monkeypatch.setattr(socket, "create_connection", lambda *_, **__: pytest.fail("it connected"))
     with pytest.raises(OutlapError, match="only https is allowed"):
-        download_tracks(["Monza"], url_template=url, patience=QUICK)
+        download_tracks(["Monza"], url_template=url, limits=QUICK)
 
 
 def test_a_redirect_may_not_leave_https(server, cache):
@@ -229,7 +229,7 @@ def test_a_download_that_is_too_large(server, cache, announced):
 
     server.answers["/Circle.tar.xz"] = large
     with pytest.raises(OutlapError, match=r"(at most|larger than) 0 MB"):
-        get(server, "Circle", limits=ArchiveLimits(packed=200_000))
+        get(server, "Circle", limits=replace(QUICK, packed=200_000))
     assert visible(cache) == []
 
 
@@ -308,7 +308,7 @@ def test_a_cache_that_cannot_be_written(server, tmp_path):
 # --- the archive --------------------------------------------------------------------------------------------
 
 
-def refused(server: ArchiveServer, cache: Path, body: bytes, match: str, limits: ArchiveLimits | None = None) -> None:
+def refused(server: ArchiveServer, cache: Path, body: bytes, match: str, limits: DownloadLimits = QUICK) -> None:
     """The archive is refused, and neither the cache nor anything around it has got a file."""
     server.answers["/Circle.tar.xz"] = body
     with pytest.raises(OutlapError, match=match) as caught:
@@ -329,7 +329,7 @@ def refused(server: ArchiveServer, cache: Path, body: bytes, match: str, limits:
     ids=["path", "bomb", "files"],
 )
 def test_a_hostile_archive(server, cache, members, extra, match):
-    refused(server, cache, tar_xz(members | extra), match, ArchiveLimits(unpacked=1_000_000))
+    refused(server, cache, tar_xz(members | extra), match, replace(QUICK, unpacked=1_000_000))
 
 
 def test_an_archive_must_hold_one_map(server, cache, members):

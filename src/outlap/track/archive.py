@@ -6,31 +6,23 @@ import io
 import lzma
 import os
 import tarfile
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from outlap.errors import OutlapError
 
 DECODER_MEMORY = 256 << 20  # [bytes]; `xz -9` asks for 65 MiB, a hostile header for up to 4 GiB
+MAX_UNPACKED = 256 << 20  # [bytes] of the tar; a track's stays far below it
+MAX_MEMBERS = 100  # files and folders
 MAX_DEPTH = 4  # folders and the file itself
 
 
-@dataclass(frozen=True)
-class ArchiveLimits:
-    """What a track's archive stays far below."""
-
-    packed: int = 64 << 20  # [bytes] the .tar.xz
-    unpacked: int = 256 << 20  # [bytes] the tar
-    members: int = 100  # files and folders
-
-
-def extract(archive: Path, folder: Path, limits: ArchiveLimits | None = None, called: str | None = None) -> list[Path]:
+def extract(archive: Path, folder: Path, max_bytes: int = MAX_UNPACKED, called: str | None = None) -> list[Path]:
     """Unpack the .tar.xz file `archive` into the existing, empty `folder`; hidden files are left out.
 
     Args:
         archive: the file.
         folder: where its regular files go, with the permissions of new files.
-        limits: sizes [bytes] and number of members; the defaults fit any F1TENTH track.
+        max_bytes: the largest tar that is accepted.
         called: the archive's name in error messages, such as the URL; its path by default.
 
     Returns the files written.
@@ -40,11 +32,10 @@ def extract(archive: Path, folder: Path, limits: ArchiveLimits | None = None, ca
             the folder, or that comes twice; a limit is passed. The caller removes what is written by then.
     """
     called = called or str(archive)
-    limits = limits or ArchiveLimits()
-    members = _Members(limits)
     try:
-        with tarfile.open(fileobj=io.BytesIO(_decompress(archive, limits.unpacked)), mode="r:") as tar:
-            tar.extractall(folder, filter=members.check)
+        with tarfile.open(fileobj=io.BytesIO(_decompress(archive, max_bytes)), mode="r:") as tar:
+            files = _plain_files(tar)
+            tar.extractall(folder, files.values(), filter="data")
     except _RefusedError as reason:
         raise OutlapError(f"{called}: {reason}; not unpacked") from None
     except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:  # a file where another needs a folder
@@ -52,7 +43,7 @@ def extract(archive: Path, folder: Path, limits: ArchiveLimits | None = None, ca
     except (lzma.LZMAError, tarfile.TarError, EOFError, RecursionError, ValueError, OverflowError) as error:
         # the last three: what tarfile lets through from hostile headers
         raise OutlapError(f"{called}: not a complete .tar.xz archive ({error})") from error
-    written = [folder.joinpath(*parts) for parts in members.files]
+    written = [folder.joinpath(*parts) for parts in files]
     for path in written:
         with path.open("rb") as file:
             os.fsync(file.fileno())
@@ -63,27 +54,21 @@ class _RefusedError(Exception):
     """Why the archive is not unpacked."""
 
 
-class _Members:
-    """A filter for `TarFile.extractall` that is stricter than tarfile's own."""
-
-    def __init__(self, limits: ArchiveLimits) -> None:
-        self.files: dict[tuple[str, ...], None] = {}  # that are unpacked, in order
-        self._limits, self._count = limits, 0
-
-    def check(self, member: tarfile.TarInfo, folder: str) -> tarfile.TarInfo | None:
-        """Return what of a member is unpacked, None for a hidden file; raise _RefusedError."""
-        self._count += 1
-        if self._count > self._limits.members:
-            raise _RefusedError(f"holds more than {self._limits.members} files")
+def _plain_files(tar: tarfile.TarFile) -> dict[tuple[str, ...], tarfile.TarInfo]:
+    """Return the visible files by the parts of their names; raise _RefusedError if any member is not acceptable."""
+    files: dict[tuple[str, ...], tarfile.TarInfo] = {}
+    for count, member in enumerate(tar, start=1):
+        if count > MAX_MEMBERS:
+            raise _RefusedError(f"holds more than {MAX_MEMBERS} files")
         parts = _safe_parts(member.name)
         if not (member.isdir() or (member.isreg() and not member.issparse())):
             raise _RefusedError(f"member {member.name!r} is not a plain file or folder")
         if member.isdir() or any(part.startswith(".") for part in parts):
-            return None
-        if parts in self.files:
+            continue
+        if parts in files:
             raise _RefusedError(f"member {member.name!r} comes twice")
-        self.files[parts] = None
-        return tarfile.data_filter(member, folder).replace(mode=0o644, deep=False)
+        files[parts] = member.replace(mode=0o644, deep=False)
+    return files
 
 
 def _decompress(archive: Path, limit: int) -> bytes:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,7 +33,7 @@ def cache_folder() -> Path:
 
 
 @contextmanager
-def staging(folder: Path, wait_s: float = 600.0) -> Iterator[Path]:
+def staging(folder: Path, wait_s: float = 600.0) -> Generator[Path, None, None]:
     """Hold the write lock of `folder`, which is made if need be, and yield a new hidden folder inside it.
 
     The hidden folder is on the same file system, so that `install` is one rename, and is removed at the end.

@@ -16,14 +16,15 @@ from pydantic import Field, TypeAdapter
 from outlap.config import Config
 from outlap.errors import OutlapError, brief
 from outlap.files import atomic_write
-from outlap.track.archive import ArchiveLimits, extract
+from outlap.track.archive import extract
 from outlap.track.cache import cache_folder, install, staging
 from outlap.track.catalog import OFFICIAL_TRACKS, is_track_folder, name_key
 from outlap.track.map_io import read_track
-from outlap.track.transfer import Patience, Progress, UnreachableError, fetch
+from outlap.track.transfer import DownloadLimits, Progress, UnreachableError, fetch
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
 
 ARCHIVE_URL = "https://api.f1tenth.org/{name}.tar.xz"
 LOCK_FILE = "tracks.lock.json"
@@ -58,8 +59,7 @@ def download_tracks(
     cache: Path | None = None,
     url_template: str = ARCHIVE_URL,
     update_lock: bool = False,
-    limits: ArchiveLimits | None = None,
-    patience: Patience | None = None,
+    limits: DownloadLimits | None = None,
     show_progress: bool = False,
 ) -> list[DownloadedTrack]:
     """Put official tracks into the cache, where their names are found; a track that is there stays as it is.
@@ -72,28 +72,30 @@ def download_tracks(
         cache: the folder of cached tracks; `cache_folder()` by default.
         url_template: https, with `{name}`.
         update_lock: fetch again what is there already, and accept an archive that has changed.
-        limits, patience: of sizes and time.
+        limits: of sizes and time.
         show_progress: a bar on standard error if that is a terminal.
 
     Raises:
         OutlapError: one or more names failed; those that did not are in the cache all the same.
     """
-    job = _Job(cache or cache_folder(), update_lock, limits or ArchiveLimits(), patience or Patience())
+    cache, limits = cache or cache_folder(), limits or DownloadLimits()
     official = dict.fromkeys(_official_name(name) for name in names)
     done: list[DownloadedTrack] = []
     failures: list[OutlapError] = []
     with _progress_bars(show_progress) as bars:
         for name in official:
             bar = bars.add_task(name, total=None)
+            url = url_template.replace("{name}", urllib.parse.quote(name))
+
+            def progress(size: int, total: int | None, bar: TaskID = bar) -> None:
+                bars.update(bar, completed=size, total=total)
+
             try:
-                url = url_template.replace("{name}", urllib.parse.quote(name))
-                done.append(
-                    job.download(name, url, lambda size, total, bar=bar: bars.update(bar, completed=size, total=total))
-                )
+                done.append(_download(name, url, cache, limits, update_lock, progress))
             except UnreachableError:
                 raise  # the others come from the same server
             except OSError as error:  # no space, for example: that ends them all
-                raise OutlapError(f"{job.cache}: cannot be written ({error.strerror or error})") from error
+                raise OutlapError(f"{cache}: cannot be written ({error.strerror or error})") from error
             except OutlapError as error:
                 hint = "" if name in OFFICIAL_TRACKS else f"; the official tracks are {_OFFICIAL}"
                 failures.append(OutlapError(f"{error}{hint}"))
@@ -106,7 +108,7 @@ def download_tracks(
 
 
 def read_lock(cache: Path) -> dict[str, LockedArchive]:
-    """The lock file of a cache, by track name; empty where there is none.
+    """Return the lock file of a cache, by track name; empty if there is none.
 
     Raises:
         OutlapError: it is not what `download_tracks` writes.
@@ -120,50 +122,43 @@ def read_lock(cache: Path) -> dict[str, LockedArchive]:
         raise OutlapError(f"{path}: not a lock file of outlap ({brief(error)}); mend it or delete it") from error
 
 
-@dataclass(frozen=True)
-class _Job:
-    """What the downloads of one call have in common."""
+def _download(
+    name: str, url: str, cache: Path, limits: DownloadLimits, update_lock: bool, progress: Progress
+) -> DownloadedTrack:
+    folder = cache / name
+    with staging(cache) as prepared:
+        locked = read_lock(cache)
+        known = locked.get(name)
+        if folder.exists():
+            if known is None:
+                raise OutlapError(f"{folder}: is there and was not downloaded; move it away to download {name}")
+            if not update_lock:
+                return DownloadedTrack(name, folder, "present", known)
 
-    cache: Path
-    update_lock: bool
-    limits: ArchiveLimits
-    patience: Patience
+        archive = prepared / "archive.tar.xz"
+        sha256, size = fetch(url, archive, limits, progress)
+        changed = known is None or known.sha256 != sha256
+        if known and changed and not update_lock:
+            raise OutlapError(
+                f"{url}: sha256 is {sha256}, but {cache / LOCK_FILE} has {known.sha256} "
+                f"of {known.date}; if the change is meant, run again with --update-lock"
+            )
+        content = prepared / "content"
+        content.mkdir()
+        extract(archive, content, limits.unpacked, called=url)
+        track_folder = _only_track_folder(content, url)
+        try:
+            read_track(track_folder)
+        except OutlapError as error:
+            raise OutlapError(f"{url}: {str(error).replace(f'{content}/', '')}") from error
 
-    def download(self, name: str, url: str, progress: Progress) -> DownloadedTrack:
-        folder = self.cache / name
-        with staging(self.cache) as prepared:
-            locked = read_lock(self.cache)
-            known = locked.get(name)
-            if folder.exists():
-                if known is None:
-                    raise OutlapError(f"{folder}: is there and was not downloaded; move it away to download {name}")
-                if not self.update_lock:
-                    return DownloadedTrack(name, folder, "present", known)
-
-            archive = prepared / "archive.tar.xz"
-            sha256, size = fetch(url, archive, self.limits.packed, self.patience, progress)
-            changed = known is None or known.sha256 != sha256
-            if known and changed and not self.update_lock:
-                raise OutlapError(
-                    f"{url}: sha256 is {sha256}, but {self.cache / LOCK_FILE} has {known.sha256} "
-                    f"of {known.date}; if the change is meant, run again with --update-lock"
-                )
-            content = prepared / "content"
-            content.mkdir()
-            extract(archive, content, self.limits, called=url)
-            track_folder = _only_track_folder(content, url)
-            try:
-                read_track(track_folder)
-            except OutlapError as error:
-                raise OutlapError(f"{url}: {str(error).replace(f'{content}/', '')}") from error
-
-            # The digest before the track: after a kill between the two, the next download is still checked.
-            if changed:
-                now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-                locked[name] = LockedArchive(url=url, sha256=sha256, size_bytes=size, date=now)
-                _write_lock(self.cache, locked)
-            install(track_folder, folder)
-        return DownloadedTrack(name, folder, "downloaded", locked[name])
+        # The digest before the track: after a kill between the two, the next download is still checked.
+        if changed:
+            now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+            locked[name] = LockedArchive(url=url, sha256=sha256, size_bytes=size, date=now)
+            _write_lock(cache, locked)
+        install(track_folder, folder)
+    return DownloadedTrack(name, folder, "downloaded", locked[name])
 
 
 def _official_name(name: str) -> str:

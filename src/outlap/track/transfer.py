@@ -7,16 +7,17 @@ import http.client
 import ipaddress
 import ssl
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from http.client import HTTPMessage
 from pathlib import Path
 from typing import IO
+from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
+from urllib.request import HTTPRedirectHandler, ProxyHandler, Request, build_opener
 
 from outlap.errors import OutlapError
+from outlap.track.archive import MAX_UNPACKED
 
 BLOCK = 1 << 16  # [bytes]
 
@@ -24,27 +25,28 @@ Progress = Callable[[int, int | None], None]  # (bytes so far, bytes in all if t
 
 
 @dataclass(frozen=True)
-class Patience:
-    """How long to wait, and how often to try."""
+class DownloadLimits:
+    """Limits of size and time for one download; a track's archive stays far below them."""
 
     timeout: float = 20.0  # [s] for a connection, and between two pieces of data
     deadline: float = 300.0  # [s] for all tries together
     tries: int = 4
     backoff: float = 1.0  # [s] before the second try, doubled before each further one
+    packed: int = 64 << 20  # [bytes] of the downloaded file
+    unpacked: int = MAX_UNPACKED  # [bytes] of its content
 
 
 class UnreachableError(OutlapError):
     """The server gave no answer at all: further files from it are not worth a try."""
 
 
-def fetch(url: str, target: Path, max_bytes: int, patience: Patience, progress: Progress) -> tuple[str, int]:
+def fetch(url: str, target: Path, limits: DownloadLimits, progress: Progress) -> tuple[str, int]:
     """Download `url` to the file `target`; a broken transfer starts again from its first byte.
 
     Args:
         url: https; http only at a loopback address. A redirect must keep to the same.
         target: written; after an error its content is of no use.
-        max_bytes: the largest file that is accepted.
-        patience: time limits and tries.
+        limits: time limits, tries and the largest file that is accepted.
         progress: called after every piece.
 
     Returns the SHA-256 as hex digits, and the size [bytes].
@@ -54,24 +56,24 @@ def fetch(url: str, target: Path, max_bytes: int, patience: Patience, progress: 
         OutlapError: the URL is not allowed, the server refuses, too large, or no try was complete in time.
     """
     _require_allowed(url)
-    give_up = time.monotonic() + patience.deadline
+    give_up = time.monotonic() + limits.deadline
     tries = 0
     while True:
         tries += 1
         try:
-            return _try_once(url, target, max_bytes, patience, give_up, progress)
-        except urllib.error.HTTPError as error:
+            return _fetch_once(url, target, limits, give_up, progress)
+        except HTTPError as error:
             error.close()
             reason = f"the server answers {error.code} {http.client.responses.get(error.code, '')}".rstrip()
-            unreachable, hopeless = False, error.code < 500 and error.code not in (408, 429)
-            if hopeless:
+            if error.code < 500 and error.code not in (408, 429):
                 raise OutlapError(f"{url}: {reason}") from error
+            unreachable = untrusted = False
         except (OSError, http.client.HTTPException) as error:
-            cause = getattr(error, "reason", error)
-            reason, unreachable = _describe(cause, patience), isinstance(error, urllib.error.URLError)
-            hopeless = isinstance(cause, ssl.SSLCertVerificationError)
-        pause = patience.backoff * 2 ** (tries - 1)
-        if hopeless or tries == patience.tries or time.monotonic() + pause > give_up:
+            cause = error.reason if isinstance(error, URLError) else error
+            reason, unreachable = _describe(cause, limits.timeout), isinstance(error, URLError)
+            untrusted = isinstance(cause, ssl.SSLCertVerificationError)
+        pause = limits.backoff * 2 ** (tries - 1)
+        if untrusted or tries == limits.tries or time.monotonic() + pause > give_up:
             break
         time.sleep(pause)
     if unreachable:
@@ -81,34 +83,31 @@ def fetch(url: str, target: Path, max_bytes: int, patience: Patience, progress: 
     raise OutlapError(f"{url}: gave up after {tries} tries ({reason}); try again later")
 
 
-def _try_once(
-    url: str, target: Path, max_bytes: int, patience: Patience, give_up: float, progress: Progress
-) -> tuple[str, int]:
-    handlers = [_CheckedRedirects(), *([urllib.request.ProxyHandler({})] if _is_loopback(url) else [])]
-    request = urllib.request.Request(url, headers={"User-Agent": "outlap", "Accept-Encoding": "identity"})
-    with urllib.request.build_opener(*handlers).open(request, timeout=patience.timeout) as response:
+def _fetch_once(url: str, target: Path, limits: DownloadLimits, give_up: float, progress: Progress) -> tuple[str, int]:
+    handlers = [_CheckedRedirects(), *([ProxyHandler({})] if _is_loopback(url) else [])]
+    request = Request(url, headers={"User-Agent": "outlap", "Accept-Encoding": "identity"})
+    with build_opener(*handlers).open(request, timeout=limits.timeout) as response, target.open("wb") as file:
         announced = response.headers.get("Content-Length", "")
         total = int(announced) if announced.isdecimal() else None
         digest, size = hashlib.sha256(), 0
-        with target.open("wb") as file:
-            while block := response.read1(BLOCK):  # what has arrived, so that a slow server meets the deadline too
-                size += len(block)
-                if max(size, total or 0) > max_bytes:
-                    raise OutlapError(f"{url}: is larger than {max_bytes / 1e6:.0f} MB, the most that is accepted")
-                if time.monotonic() > give_up:
-                    raise OutlapError(f"{url}: not complete after {patience.deadline:g} s; try again later")
-                digest.update(block)
-                file.write(block)
-                progress(size, total)
+        while block := response.read1(BLOCK):  # what has arrived, so that a slow server meets the deadline too
+            size += len(block)
+            if max(size, total or 0) > limits.packed:
+                raise OutlapError(f"{url}: is larger than {limits.packed / 1e6:.0f} MB, the most that is accepted")
+            if time.monotonic() > give_up:
+                raise OutlapError(f"{url}: not complete after {limits.deadline:g} s; try again later")
+            digest.update(block)
+            file.write(block)
+            progress(size, total)
     if total is not None and size != total:
         raise http.client.IncompleteRead(b"", total - size)
     return digest.hexdigest(), size
 
 
-class _CheckedRedirects(urllib.request.HTTPRedirectHandler):
+class _CheckedRedirects(HTTPRedirectHandler):
     def redirect_request(
-        self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: HTTPMessage, newurl: str
-    ) -> urllib.request.Request | None:
+        self, req: Request, fp: IO[bytes], code: int, msg: str, headers: HTTPMessage, newurl: str
+    ) -> Request | None:
         _require_allowed(newurl, loopback=_is_loopback(req.full_url))
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
@@ -131,15 +130,16 @@ def _is_loopback(url: str) -> bool:
         return host == "localhost"
 
 
-def _describe(cause: object, patience: Patience) -> str:
+def _describe(cause: Exception | str, timeout: float) -> str:
     """Return what broke a transfer, in a few words."""
     match cause:
         case http.client.IncompleteRead():
             return "the connection ended too early"
         case TimeoutError():
-            return f"no data for {patience.timeout:g} s"
+            return f"no data for {timeout:g} s"
         case ssl.SSLCertVerificationError():
             return f"its certificate is not trusted: {cause.verify_message}"
         case OSError() if cause.strerror:
             return cause.strerror.lower()
-    return str(cause) or type(cause).__name__
+        case _:
+            return str(cause) or type(cause).__name__
