@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import pydantic_core
 
 from outlap.errors import OutlapError
 
@@ -54,14 +54,13 @@ def remove_partials(folder: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    if process == os.getpid() or os.name == "nt":  # where os.kill would end it
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # it is another user's, or cannot be asked for
-        return True
+    if process != os.getpid() and os.name != "nt":  # on Windows, os.kill would end it
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return False
+        except OSError:  # another user's
+            return True
     return True
 
 
@@ -73,28 +72,18 @@ def atomic_write(path: str | os.PathLike[str], content: str | bytes) -> Path:
 
 
 def to_json(data: Any) -> str:
-    """`data` as indented JSON: NaN and infinity as null, arrays as lists, paths as strings."""
-    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
+    """Return `data` as indented JSON: NaN and infinity as null, arrays as lists, paths as strings.
+
+    Raises TypeError for an object that is not plain data, an array, a dataclass or a Config.
+    """
+    try:
+        plain = pydantic_core.to_json(data, inf_nan_mode="null", fallback=_array_as_list)
+    except pydantic_core.PydanticSerializationError as error:
+        raise TypeError(str(error)) from None
+    return json.dumps(json.loads(plain), indent=2, ensure_ascii=False)
 
 
-def _plain(value: Any) -> Any:
-    match value:
-        case None | bool() | str():
-            return value
-        case float():  # np.float64 is one too
-            return float(value) if math.isfinite(value) else None
-        case int():
-            return int(value)
-        case os.PathLike():
-            return os.fspath(value)
-        case Mapping():
-            return {str(_plain(key)): _plain(each) for key, each in value.items()}
-        case list() | tuple() | set() | frozenset():
-            return [_plain(each) for each in value]
-    if hasattr(value, "model_dump"):  # a Config
-        return _plain(value.model_dump(mode="json"))
+def _array_as_list(value: Any) -> Any:
     if hasattr(value, "tolist"):  # NumPy scalars and arrays, without importing NumPy for those who have none
-        return _plain(value.tolist())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    raise TypeError(f"a {type(value).__name__} has no form in JSON")
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} has no form in JSON")

@@ -48,21 +48,11 @@ class CarLimits:
     @classmethod
     def of_record(cls, record: np.ndarray) -> CarLimits:
         """Return the limits of a car, a record of `simulator.vehicle.PARAMETERS`."""
-        p = {name: float(record[name]) for name in NAMES}
-        wheelbase = p["lf"] + p["lr"]
-        lock = min(p["steer_max"], -p["steer_min"])
-        values = {
-            "mu": p["mu"],
-            "a_max": p["a_max"],
-            "a_brake": p["a_max"],
-            "v_max": p["v_max"],
-            "v_switch": p["v_switch"],
-            "max_curvature": math.tan(lock) / wheelbase,
-            "steer_rate_max": p["steer_rate_max"],
-            "wheelbase": wheelbase,
-            "length": p["length"],
-            "width": p["width"],
-        }
+        values = {name: float(record[name]) for name in NAMES}
+        wheelbase = values["lf"] + values["lr"]
+        lock = min(values["steer_max"], -values["steer_min"])
+        values |= {"a_brake": values["a_max"], "max_curvature": math.tan(lock) / wheelbase, "wheelbase": wheelbase}
+        values = {field.name: values[field.name] for field in fields(cls)}
         return cls(**{name: float(f"{value:.6g}") for name, value in values.items()})
 
     def implied_by(self, line: Raceline) -> CarLimits:

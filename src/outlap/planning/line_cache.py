@@ -8,7 +8,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from outlap.track.track import Track
 
 VERSION = 1  # of the planner: grows with every change that moves a line
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
@@ -31,47 +30,33 @@ def cached_line(
 ) -> PlannedLine:
     """`plan_line`, or what it found before for the same walls, centreline, limits and margin."""
 
-    def plan() -> PlannedLine:
+    def plan() -> dict[str, np.ndarray]:
         log.info("%s: planning the %s line; it is kept for the next time", track.name, method)
-        return plan_line(track, limits, method, margin)
-
-    def to_arrays(planned: PlannedLine) -> dict[str, np.ndarray]:
+        planned = plan_line(track, limits, method, margin)
         numbers = np.array([planned.lap_time, planned.min_margin, planned.solve_time])
         return {**path_arrays(planned.path), "speed": planned.speed, "numbers": numbers}
 
-    def from_arrays(saved: Mapping[str, np.ndarray]) -> PlannedLine:
-        return PlannedLine(path_of(saved), saved["speed"], method, limits, *saved["numbers"].tolist())
-
-    return cached(["line", track.fingerprint, asdict(limits), method, margin], plan, to_arrays, from_arrays)
+    saved = cached(["line", track.fingerprint, asdict(limits), method, margin], plan)
+    return PlannedLine(path_of(saved), saved["speed"], method, limits, *saved["numbers"].tolist())
 
 
-def cached(
-    key: Any,
-    make: Callable[[], T],
-    to_arrays: Callable[[T], Mapping[str, np.ndarray]],
-    from_arrays: Callable[[Mapping[str, np.ndarray]], T],
-) -> T:
-    """What was made before under a key, or what `make` makes now.
+def cached(key: Any, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the arrays kept under `key`, plain data that determines them; else make and keep them.
 
     A cache that cannot be read or written, or holds half a file, costs time and nothing else.
-
-    Args:
-        key: plain data that settles what is made.
-        make: makes it.
-        to_arrays, from_arrays: what of it is written, and how it is read back.
     """
     digest = hashlib.sha256(json.dumps([VERSION, key], sort_keys=True).encode()).hexdigest()
     file = cache_root() / "planning" / f"{digest}.npz"
     try:
         with np.load(file) as saved:
-            return from_arrays(dict(saved))
+            return dict(saved)
     except FileNotFoundError:
         pass
     except Exception as error:  # whatever a broken archive raises
         log.warning("%s: cannot be read (%s) and is made anew", file, brief(error))
     made = make()
     buffer = io.BytesIO()
-    np.savez(buffer, **to_arrays(made))  # type: ignore[arg-type]
+    np.savez(buffer, **made)  # type: ignore[arg-type]
     try:
         atomic_write(file, buffer.getvalue())
     except OSError as error:
@@ -80,7 +65,7 @@ def cached(
 
 
 def path_arrays(path: ClosedPath, prefix: str = "") -> dict[str, np.ndarray]:
-    """Return a path as `cached` writes it."""
+    """Return a path as arrays for `cached`."""
     columns = np.column_stack([path.points, path.heading, path.curvature])
     return {f"{prefix}path": columns, f"{prefix}length": np.array(path.length)}
 
@@ -88,6 +73,5 @@ def path_arrays(path: ClosedPath, prefix: str = "") -> dict[str, np.ndarray]:
 def path_of(saved: Mapping[str, np.ndarray], prefix: str = "") -> ClosedPath:
     """The inverse of `path_arrays`."""
     columns = saved[f"{prefix}path"]
-    return ClosedPath(
-        columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy(), float(saved[f"{prefix}length"])
-    )
+    points, heading, curvature = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
+    return ClosedPath(points, heading, curvature, float(saved[f"{prefix}length"]))

@@ -57,18 +57,16 @@ def min_laps(track: Track, vehicle: VehicleParams) -> MinLaps:
     low, high = (CarLimits.of_record(to_records(values)) for values in parameter_bounds(vehicle))
     middle = CarLimits.of(vehicle)
 
-    def to_arrays(table: MinLaps) -> dict[str, np.ndarray]:
+    def plan() -> dict[str, np.ndarray]:
+        table = _table(track, low, middle, high)
         arrays = {"error": np.array(table.error), "count": np.array(len(table.lines))}
         for number, line in enumerate(table.lines):
             arrays |= path_arrays(line, f"{number}_")
         return arrays
 
-    def from_arrays(saved: Mapping[str, np.ndarray]) -> MinLaps:
-        lines = tuple(path_of(saved, f"{number}_") for number in range(int(saved["count"])))
-        return MinLaps(lines, float(saved["error"]))
-
-    key = ["laps", track.fingerprint, *map(asdict, (low, middle, high)), DEFAULT_MARGIN]
-    return cached(key, lambda: _table(track, low, middle, high), to_arrays, from_arrays)
+    saved = cached(["laps", track.fingerprint, *map(asdict, (low, middle, high)), DEFAULT_MARGIN], plan)
+    lines = tuple(path_of(saved, f"{number}_") for number in range(int(saved["count"])))
+    return MinLaps(lines, float(saved["error"]))
 
 
 def _table(track: Track, low: CarLimits, middle: CarLimits, high: CarLimits) -> MinLaps:

@@ -42,21 +42,17 @@ class TrackEntry:
     split: Literal["train", "held_out"] | None = None  # of the built-in set
 
     def load(self) -> Track:
-        """The track itself, with this name; OutlapError if its files are not valid."""
+        """Return the track, with this name; raise OutlapError if its files are not valid."""
         if self.path is None:
             return builtin_track(self.name)
         track = map_io.read_track(self.path)
         return track if track.name == self.name else replace(track, name=self.name)
 
     def length(self) -> float:
-        """Length of the centreline [m], read without the map's image; OutlapError if the csv is not valid."""
+        """Return the length of the centreline [m] without reading the map; raise OutlapError if the csv is bad."""
         if self.path is None:
             return (TRAINING_CIRCUITS | HELD_OUT_CIRCUITS)[self.name].length
-        likely = [self.path / f"{name}_centerline.csv" for name in (self.name, self.path.name)]
-        found = [path for path in (*likely, *sorted(self.path.glob("*_centerline.csv"))) if path.is_file()]
-        if not found:
-            raise OutlapError(f"{self.path}: has no {self.name}_centerline.csv; a track needs its centreline")
-        return map_io.read_centerline_csv(found[0]).length
+        return map_io.read_centerline_csv(map_io.find_centerline_csv(self.path, self.name)).length
 
 
 def load_track(path_or_name: str | os.PathLike[str]) -> Track:
@@ -109,10 +105,9 @@ def list_tracks() -> list[TrackEntry]:
         for path in _track_folders(folder):
             name = _name_of(path)
             found.setdefault(name, TrackEntry(name, source, path))
-    for name in BUILTIN_TRAIN:
-        found.setdefault(name, TrackEntry(name, "builtin", split="train"))
-    for name in BUILTIN_HELD_OUT:
-        found.setdefault(name, TrackEntry(name, "builtin", split="held_out"))
+    for name in BUILTIN_TRAIN + BUILTIN_HELD_OUT:
+        split = "train" if name in BUILTIN_TRAIN else "held_out"
+        found.setdefault(name, TrackEntry(name, "builtin", split=split))
     return list(found.values())
 
 
@@ -127,14 +122,11 @@ def find_track(name: str) -> Track:
 
 def find_entry(name: str) -> TrackEntry:
     """Where `find_track` finds `name`, nothing loaded; raises OutlapError where no track has this name."""
-    entries = list_tracks()
-    for entry in entries:
-        if entry.name == name:
-            return entry
-    key = name_key(name)
-    for entry in entries:
-        if key and name_key(entry.name) == key:
-            return entry
+    entries, key = list_tracks(), name_key(name)
+    same = [entry for entry in entries if entry.name == name]
+    alike = [entry for entry in entries if key and name_key(entry.name) == key]
+    if same or alike:
+        return (same or alike)[0]
     raise OutlapError(_not_found(name, entries))
 
 

@@ -4,14 +4,18 @@ Frenet coordinates: `s` [m] along the line from the start line, `d` [m] to its l
 float32 table of the same curve (`Centerline.table`).
 """
 
+# SciPy has no type stubs:
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial import KDTree
@@ -130,7 +134,7 @@ class Centerline:
         target = target.reshape(-1, 2)
         tree, samples = self._search_tree
         spacing = self.length / len(samples)
-        start = samples[tree.query(target)[1]]
+        start = samples[cast("NDArray[np.intp]", tree.query(target)[1])]
         low, high = start - spacing, start + spacing
         s = start.copy()
         active = np.arange(len(s))
@@ -241,12 +245,13 @@ def _fit_drivable(points: np.ndarray) -> tuple[CubicSpline, CubicHermiteSpline, 
         return fitted
     closed = np.vstack([points, points[:1]])
     chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(closed, axis=0).T))])
-    count = max(256, math.ceil(chord[-1] / 0.01))
-    spacing = chord[-1] / count
+    length = float(chord[-1])
+    count = max(256, math.ceil(length / 0.01))
+    spacing = length / count
     dense = np.column_stack([np.interp(np.arange(count) * spacing, chord, closed[:, axis]) for axis in (0, 1)])
     at = np.append(np.arange(count), count) * spacing
     for width in _SMOOTHING:
-        smooth = ndimage.gaussian_filter1d(dense, width / spacing, axis=0, mode="wrap")
+        smooth = cast("np.ndarray", ndimage.gaussian_filter1d(dense, width / spacing, axis=0, mode="wrap"))
         smooth = np.vstack([smooth, smooth[:1]])
         candidate = _fit(np.column_stack([np.interp(chord[:-1], at, smooth[:, axis]) for axis in (0, 1)]))
         if _sharpest(candidate) * _TIGHTEST_RADIUS <= 1.0:

@@ -9,12 +9,17 @@ left of an edge is a straight. The polygon is scaled until the length is right.
 Points are complex numbers in this file: x + iy [m].
 """
 
+# SciPy has no type stubs:
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from outlap.errors import OutlapError
@@ -28,7 +33,7 @@ PLAIN_AFTER = 200  # attempts; then only near-rings are tried
 ATTEMPTS = 300
 
 
-def _gauss_legendre(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_legendre(nodes: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Nodes and weights on [0, 1]."""
     x, weights = np.polynomial.legendre.leggauss(nodes)
     return (x + 1) / 2, weights / 2
@@ -106,11 +111,12 @@ def _draw_sketch(rng: np.random.Generator, corners: float, length: float, min_ra
     polygon = polygon * np.exp(1j * rng.uniform(0, 2 * np.pi))
     edges = np.abs(np.roll(polygon, -1) - polygon)
     longest_first = np.argsort(-edges)
-    zigzags = []
+    zigzags: list[_Zigzag] = []
     # The longest edge stays whole: it is the main straight.
     for edge in longest_first[1:][: min(int(rng.integers(1, 4)), round(length / max(100, 40 * min_radius)))]:
         esses = rng.uniform() < 0.3
-        turn = rng.uniform(*np.radians((20, 45) if esses else (40, 75)))
+        low, high = (20, 45) if esses else (40, 75)
+        turn = rng.uniform(math.radians(low), math.radians(high))
         diagonal = 2 * _least_radius(turn, min_radius) * _tangent(turn) * rng.uniform(1.2, 2.0)
         zigzags.append(
             _Zigzag(
@@ -178,7 +184,7 @@ def _crosses_itself(polygon: np.ndarray) -> bool:
     a, b = polygon[:, None], np.roll(polygon, -1)[:, None]
     c, d = a.T, b.T
 
-    def side(p, q, r):
+    def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
         return np.sign(np.imag((q - p).conj() * (r - p)))
 
     return bool(np.any((side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)))
@@ -299,8 +305,9 @@ def _trace(vertices: np.ndarray, radii: np.ndarray, spacing: float) -> tuple[np.
     s = np.concatenate(((0.0, half), half + np.cumsum(pieces)))
     curvature = np.concatenate(((0.0, 0.0), ends))
     headings = np.append(0.0, np.cumsum(np.diff(s) * (curvature[1:] + curvature[:-1]) / 2))
-    count = math.ceil(s[-1] / spacing)
-    step = s[-1] / count
+    lap = float(s[-1])
+    count = math.ceil(lap / spacing)
+    step = lap / count
     share, weights = FINE_QUADRATURE
     at = (np.arange(count)[:, None] + share) * step
     piece = np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(s) - 2)
@@ -308,7 +315,8 @@ def _trace(vertices: np.ndarray, radii: np.ndarray, spacing: float) -> tuple[np.
     slope = np.diff(curvature) / np.maximum(np.diff(s), 1e-12)
     heading = headings[piece] + curvature[piece] * into + slope[piece] * into**2 / 2
     start = np.angle(vertices[first] - vertices[main])
-    chords = np.exp(1j * (heading + start)) @ weights * step
+    directions: NDArray[np.complex128] = np.exp(1j * (heading + start))
+    chords = directions @ weights * step
     chords -= np.mean(chords)  # closes what quadrature left open, under a micrometre
     return np.append(0.0, np.cumsum(chords)[:-1]), float(2 * half)
 
@@ -320,7 +328,8 @@ def _keeps_clear(points: np.ndarray, length: float, clearance: float) -> bool:
     of that radius are as far apart as its diameter, unless another part of the track comes near.
     """
     coarse = points[:: max(1, int(0.1 * clearance * len(points) / length))]
-    pairs = KDTree(np.column_stack((np.real(coarse), np.imag(coarse)))).query_pairs(clearance, output_type="ndarray")
+    tree = KDTree(np.column_stack((np.real(coarse), np.imag(coarse))))
+    pairs = cast("NDArray[np.intp]", tree.query_pairs(clearance, output_type="ndarray"))
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(coarse) - apart) * length / len(coarse)
     return bool(np.all(apart <= 1.05 * math.pi / 2 * clearance))

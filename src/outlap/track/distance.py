@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 
 def wall_distance(occupancy: np.ndarray, resolution: float) -> np.ndarray:
@@ -35,7 +36,7 @@ def wall_distance(occupancy: np.ndarray, resolution: float) -> np.ndarray:
 
 
 @njit(cache=True)
-def _centre_distance(grown, resolution):
+def _centre_distance(grown: NDArray[np.bool_], resolution: float) -> NDArray[np.float32]:
     """Distance between each cell's centre and the nearest True cell's; the grid's border is True."""
     height, width = grown.shape
     vertical = np.zeros((height, width), dtype=np.int32)  # cells to the nearest True one in the column

@@ -163,9 +163,9 @@ def _download(
 
 def _official_name(name: str) -> str:
     """The archive's spelling of a name; one that is not on the list is taken as it is."""
-    for official in OFFICIAL_TRACKS:
-        if name_key(name) == name_key(official):
-            return official
+    official = {name_key(each): each for each in OFFICIAL_TRACKS}.get(name_key(name))
+    if official is not None:
+        return official
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
         raise OutlapError(f"{name!r} cannot be the name of a track in the archive; the official ones are {_OFFICIAL}")
     return name

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+import numbers
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -82,13 +83,7 @@ def generate_track(
     half_widths = np.full(len(points), width / 2)
     centerline = Centerline.from_points(points, half_widths, half_widths)
     occupancy, origin = draw_walls(centerline, resolution, MARGIN)
-    return Track(
-        name=f"generated-{seed}" if name is None else name,
-        occupancy=occupancy,
-        resolution=resolution,
-        origin=origin,
-        centerline=centerline,
-    )
+    return Track(f"generated-{seed}" if name is None else name, occupancy, resolution, origin, centerline)
 
 
 @functools.cache
@@ -102,27 +97,16 @@ def builtin_track(name: str) -> Track:
     if circuit is None:
         known = ", ".join(BUILTIN_TRAIN + BUILTIN_HELD_OUT)
         raise OutlapError(f"built-in track: name is {name!r}; must be one of {known}")
-    return generate_track(
-        seed=circuit.seed,
-        length=circuit.length,
-        width=circuit.width,
-        min_radius=circuit.min_radius,
-        name=name,
-        clockwise=circuit.clockwise,
-        resolution=BUILTIN_RESOLUTION,
-    )
+    return generate_track(name=name, resolution=BUILTIN_RESOLUTION, **asdict(circuit))
 
 
 def _validate(seed: int, length: float, width: float, min_radius: float, resolution: float) -> None:
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+    whole: object = seed
+    if isinstance(whole, bool) or not isinstance(whole, numbers.Integral) or whole < 0:
         raise OutlapError(f"generate_track: seed is {seed!r}; must be a whole number, 0 or more")
-    for field, value in (
-        ("length", length),
-        ("width", width),
-        ("min_radius", min_radius),
-        ("resolution", resolution),
-    ):
-        if not (isinstance(value, int | float | np.number) and math.isfinite(value) and value > 0):
+    sizes: dict[str, object] = {"length": length, "width": width, "min_radius": min_radius, "resolution": resolution}
+    for field, value in sizes.items():
+        if not (isinstance(value, numbers.Real) and math.isfinite(value) and float(value) > 0):
             raise OutlapError(f"generate_track: {field} is {value!r}; must be a positive number of metres")
     if min_radius < width / 2:
         raise OutlapError(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import yaml
@@ -38,14 +38,13 @@ def read_map(path: Path) -> MapImage:
     map_server calls unknown is not one. The image must lie in the yaml's folder.
     """
     fields = _read_yaml(path)
-    resolution = _number(path, fields, "resolution", "a positive number of metres per pixel")
-    if resolution <= 0.0:
-        raise OutlapError(f"{path}: resolution is {resolution}; it must be a positive number of metres per pixel")
+    right = "a positive number of metres per pixel"
+    resolution = _number(path, "resolution", fields["resolution"], right, lambda value: value > 0.0)
     return MapImage(_read_occupancy(path, fields), resolution, _origin(path, fields))
 
 
 def read_text(path: Path) -> str:
-    """The text of a UTF-8 file; OutlapError where there is none."""
+    """Return the text of a UTF-8 file; raise OutlapError if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -68,6 +67,7 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
         raise OutlapError(f"{path}: is not valid yaml{where}: {' '.join(str(problem).split())}") from None
     if not isinstance(fields, Mapping):
         raise OutlapError(f"{path}: holds {short_repr(fields)}; it must be a mapping with image, resolution and origin")
+    fields = cast("Mapping[str, Any]", fields)
     for field in ("image", "resolution", "origin"):
         if fields.get(field) is None:
             raise OutlapError(f"{path}: {field} is missing; a map needs image, resolution and origin")
@@ -82,8 +82,8 @@ def _read_occupancy(path: Path, fields: Mapping[str, Any]) -> np.ndarray:
     negate = fields.get("negate", 0)
     if negate not in (0, 1):  # True and False are these too
         raise OutlapError(f"{path}: negate is {short_repr(negate)}; it must be 0 or 1")
-    occupied = _probability(path, fields, "occupied_thresh", _OCCUPIED_THRESHOLD)
-    free = _probability(path, fields, "free_thresh", min(_FREE_THRESHOLD, occupied))
+    occupied = _threshold(path, fields, "occupied_thresh", _OCCUPIED_THRESHOLD)
+    free = _threshold(path, fields, "free_thresh", min(_FREE_THRESHOLD, occupied))
     if free > occupied:
         raise OutlapError(f"{path}: free_thresh is {free}; it must not be above occupied_thresh, {occupied}")
     sums, highest = _channel_sums(_image_path(path, fields["image"]), average_alpha=mode == "trinary")
@@ -94,21 +94,20 @@ def _read_occupancy(path: Path, fields: Mapping[str, Any]) -> np.ndarray:
 
 
 def _image_path(yaml_path: Path, image: object) -> Path:
+    wrong = f"{yaml_path}: image is {short_repr(image)}"
     if not isinstance(image, str) or not image.strip():
-        raise OutlapError(f"{yaml_path}: image is {short_repr(image)}; it must be the name of a file in the folder")
+        raise OutlapError(f"{wrong}; it must be the name of a file in the folder")
     folder = yaml_path.parent.resolve()
     try:
         path = (folder / image).resolve()
         inside = not Path(image).is_absolute() and path.is_relative_to(folder)
         is_file = inside and path.is_file()
     except (OSError, ValueError, RuntimeError):
-        raise OutlapError(
-            f"{yaml_path}: image is {short_repr(image)}; it must be the name of a file in the folder"
-        ) from None
+        raise OutlapError(f"{wrong}; it must be the name of a file in the folder") from None
     if not inside:
-        raise OutlapError(f"{yaml_path}: image is {short_repr(image)}; it must not lead out of the folder")
+        raise OutlapError(f"{wrong}; it must not lead out of the folder")
     if not is_file:
-        raise OutlapError(f"{yaml_path}: image is {short_repr(image)}; there is no such file in the folder")
+        raise OutlapError(f"{wrong}; there is no such file in the folder")
     return path
 
 
@@ -117,6 +116,7 @@ def _channel_sums(path: Path, average_alpha: bool) -> tuple[np.ndarray, int]:
 
     As in ROS map_server, an alpha channel is averaged with the colours in trinary mode.
     """
+    most = f"it must have at most {MAX_PIXELS // 1_000_000} million"
     try:
         # Pillow warns of, then refuses, big pictures at sizes of its own.
         with warnings.catch_warnings():
@@ -124,10 +124,10 @@ def _channel_sums(path: Path, average_alpha: bool) -> tuple[np.ndarray, int]:
             opened = Image.open(path)
         with opened as image:
             if image.width * image.height > MAX_PIXELS:
-                raise OutlapError(_too_big(path, f"{image.width} x {image.height} pixels"))
+                raise OutlapError(f"{path}: has {image.width} x {image.height} pixels; {most}")
             return _sum_channels(path, image, average_alpha)
     except Image.DecompressionBombError:
-        raise OutlapError(_too_big(path, "too many pixels")) from None
+        raise OutlapError(f"{path}: has too many pixels; {most}") from None
     except OutlapError:
         raise
     except (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, OverflowError) as error:
@@ -154,38 +154,32 @@ def _sum_channels(path: Path, image: Image.Image, average_alpha: bool) -> tuple[
     return channels.sum(axis=2, dtype=np.uint16), 255 * channels.shape[2]
 
 
-def _too_big(path: Path, size: str) -> str:
-    return f"{path}: has {size}; it must have at most {MAX_PIXELS // 1_000_000} million"
-
-
 def _origin(path: Path, fields: Mapping[str, Any]) -> tuple[float, float, float]:
     origin = fields["origin"]
     right = "it must be [x, y, yaw] in metres and radians"
-    if not isinstance(origin, list) or len(origin) != 3:
+    values = cast("list[object]", origin) if isinstance(fields["origin"], list) else []
+    if len(values) != 3:
         raise OutlapError(f"{path}: origin is {short_repr(origin)}; {right}")
-    x, y, yaw = (_to_float(value) for value in origin)
+    x, y, yaw = map(_to_float, values)
     if x is None or y is None or yaw is None:
         raise OutlapError(f"{path}: origin is {short_repr(origin)}; {right}, all finite")
     return x, y, yaw
 
 
-def _number(path: Path, fields: Mapping[str, Any], field: str, right: str) -> float:
-    value = _to_float(fields[field])
-    if value is None:
-        raise OutlapError(f"{path}: {field} is {short_repr(fields[field])}; it must be {right}")
-    return value
+def _number(path: Path, field: str, value: object, right: str, valid: Callable[[float], bool]) -> float:
+    number = _to_float(value)
+    if number is None or not valid(number):
+        raise OutlapError(f"{path}: {field} is {short_repr(value)}; it must be {right}")
+    return number
 
 
-def _probability(path: Path, fields: Mapping[str, Any], field: str, default: float) -> float:
-    right = "a number from 0 to 1"
-    value = default if fields.get(field) is None else _number(path, fields, field, right)
-    if not 0.0 <= value <= 1.0:
-        raise OutlapError(f"{path}: {field} is {value}; it must be {right}")
-    return value
+def _threshold(path: Path, fields: Mapping[str, Any], field: str, default: float) -> float:
+    value = default if fields.get(field) is None else fields[field]
+    return _number(path, field, value, "a number from 0 to 1", lambda share: 0.0 <= share <= 1.0)
 
 
 def _to_float(value: object) -> float | None:
-    """`value` as a finite float; None for anything else. Yaml reads 1e-2 as text: that counts."""
+    """Return `value` as a finite float, or None. Text counts, because yaml reads 1e-2 as text."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
     try:

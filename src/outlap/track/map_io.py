@@ -38,13 +38,14 @@ def read_track(folder: str | os.PathLike[str]) -> Track:
     folder = Path(folder)
     if not folder.is_dir():
         raise OutlapError(f"{folder}: is not a folder; give a map folder with NAME_map.yaml in it")
-    yaml_path = _map_yaml(folder)
+    here = folder.resolve().name
+    yaml_path = _only_file(folder, [f"{here}_map.yaml", f"{here}.yaml"], (".yaml", ".yml"), "yaml files")
+    if yaml_path is None:
+        raise OutlapError(f"{folder}: has no yaml file; a map folder holds {here}_map.yaml or {here}.yaml")
     name = yaml_path.stem.removesuffix("_map")
-    name = folder.resolve().name if name in ("", "map") else name
+    name = here if name in ("", "map") else name
     map_image = read_map(yaml_path)
-    centerline_path = _csv_beside(folder, name, "_centerline.csv")
-    if centerline_path is None:
-        raise OutlapError(f"{folder}: has no {name}_centerline.csv; a track needs its centreline")
+    centerline_path = find_centerline_csv(folder, name)
     raceline_path = _csv_beside(folder, name, "_raceline.csv")
     track = Track(
         name=name,
@@ -161,39 +162,40 @@ def write_raceline_csv(line: Raceline, path: str | os.PathLike[str]) -> Path:
 
 
 def find_yaml_files(folder: Path) -> list[Path]:
-    """The yaml files in `folder`, sorted; hidden ones are left out."""
-    return [path for path in _visible_files(folder) if path.suffix.lower() in (".yaml", ".yml")]
+    """Return the yaml files in `folder`, sorted; hidden ones are left out."""
+    return _visible_files(folder, (".yaml", ".yml"))
 
 
-def _visible_files(folder: Path) -> list[Path]:
+def find_centerline_csv(folder: Path, name: str) -> Path:
+    """Return `NAME_centerline.csv` or the folder's only such file; raise OutlapError if there is none."""
+    path = _csv_beside(folder, name, "_centerline.csv")
+    if path is None:
+        raise OutlapError(f"{folder}: has no {name}_centerline.csv; a track needs its centreline")
+    return path
+
+
+def _visible_files(folder: Path, endings: tuple[str, ...]) -> list[Path]:
     try:
-        return sorted(path for path in folder.iterdir() if path.name[0] != "." and path.is_file())
+        found = [path for path in folder.iterdir() if path.name[0] != "." and path.name.lower().endswith(endings)]
+        return sorted(path for path in found if path.is_file())
     except OSError as error:
         raise OutlapError(f"{folder}: cannot be read: {error.strerror}") from None
 
 
-def _map_yaml(folder: Path) -> Path:
-    name = folder.resolve().name
-    for path in (folder / f"{name}_map.yaml", folder / f"{name}.yaml"):
-        if path.is_file():
-            return path
-    found = find_yaml_files(folder)
-    if len(found) == 1:
-        return found[0]
-    if not found:
-        raise OutlapError(f"{folder}: has no yaml file; a map folder holds {name}_map.yaml or {name}.yaml")
-    names = ", ".join(path.name for path in found[:5])
-    raise OutlapError(f"{folder}: has {len(found)} yaml files ({names}); name the map's {name}_map.yaml")
-
-
 def _csv_beside(folder: Path, name: str, ending: str) -> Path | None:
-    for path in (folder / f"{name}{ending}", folder / f"{folder.resolve().name}{ending}"):
+    names = [f"{name}{ending}", f"{folder.resolve().name}{ending}"]
+    return _only_file(folder, names, (ending,), f"files *{ending}")
+
+
+def _only_file(folder: Path, names: list[str], endings: tuple[str, ...], what: str) -> Path | None:
+    """Return the first of `names` that is in the folder, else its only visible file with one of the endings."""
+    for path in (folder / name for name in names):
         if path.is_file():
             return path
-    found = [path for path in _visible_files(folder) if path.name.endswith(ending)]
+    found = _visible_files(folder, endings)
     if len(found) > 1:
-        names = ", ".join(path.name for path in found[:5])
-        raise OutlapError(f"{folder}: has {len(found)} files *{ending} ({names}); name the map's {name}{ending}")
+        listed = ", ".join(path.name for path in found[:5])
+        raise OutlapError(f"{folder}: has {len(found)} {what} ({listed}); name the map's {names[0]}")
     return found[0] if found else None
 
 
@@ -223,7 +225,7 @@ def _read_csv(path: Path, columns: tuple[str, ...], least: int = MIN_POINTS) -> 
             continue  # a header without its #
         if len(cells) != len(columns):
             raise OutlapError(f"{path}: line {line}: has {len(cells)} columns; it must have {expected}")
-        row = []
+        row: list[float] = []
         for cell, number, column in zip(cells, numbers, columns, strict=True):
             if number is None or not math.isfinite(number):
                 raise OutlapError(f"{path}: line {line}: {column} is {short_repr(cell)}; it must be a finite number")
@@ -274,11 +276,8 @@ def _require_clear_centerline(track: Track, path: Path) -> None:
     col, row = track.world_to_grid(x[first], y[first])
     height, width = track.occupancy.shape
     inside = 0 <= col < width and 0 <= row < height
-    what, right = (
-        ("passes through a wall", "all of it must be free")
-        if inside
-        else ("leaves the map", "all of it must lie inside")
-    )
+    what = "passes through a wall" if inside else "leaves the map"
+    right = "all of it must be free" if inside else "all of it must lie inside"
     raise OutlapError(
         f"{path}: the centreline {what} at s = {s[first]:.2f} m, x_m = {x[first]:.3f}, y_m = {y[first]:.3f}; {right}"
     )

@@ -130,7 +130,7 @@ def _is_loopback(url: str) -> bool:
         return host == "localhost"
 
 
-def _describe(cause: Exception | str, timeout: float) -> str:
+def _describe(cause: BaseException | str, timeout: float) -> str:
     """Return what broke a transfer, in a few words."""
     match cause:
         case http.client.IncompleteRead():

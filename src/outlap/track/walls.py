@@ -1,10 +1,15 @@
 """Walls drawn from a centreline and its widths."""
 
+# SciPy has no type stubs:
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from outlap.errors import OutlapError
@@ -54,7 +59,7 @@ def draw_walls(
     rows, cols = _near_pixels(tree, low, (height, width), resolution, reach)
     centres = np.stack([low[0] + (cols + 0.5) * resolution, low[1] + (rows + 0.5) * resolution], axis=1)
     # No free pixel is further away than that: the bound only cuts the search short.
-    nearest = np.asarray(tree.query(centres, distance_upper_bound=reach + resolution)[1])
+    nearest = cast("NDArray[np.intp]", tree.query(centres, distance_upper_bound=reach + resolution)[1])
     found = nearest < count
     rows, cols, centres, nearest = rows[found], cols[found], centres[found], nearest[found]
     away = centres - line[nearest]
@@ -76,7 +81,7 @@ def _near_pixels(
     size = _BLOCK * resolution
     centre = np.stack([low[0] + (block_col + 0.5) * size, low[1] + (block_row + 0.5) * size], axis=-1)
     limit = reach + size / math.sqrt(2.0) + resolution
-    distance, _ = tree.query(centre.reshape(-1, 2), distance_upper_bound=limit)
+    distance = cast("NDArray[np.float64]", tree.query(centre.reshape(-1, 2), distance_upper_bound=limit)[0])
     near = np.flatnonzero(np.isfinite(distance))
     inner_row, inner_col = np.indices((_BLOCK, _BLOCK))
     rows = (block_row.ravel()[near, None] * _BLOCK + inner_row.ravel()).ravel()
