@@ -155,10 +155,12 @@ def evaluation(folder: Path) -> str:
 def policy_evaluation(folder: Path) -> str:
     """Of a PPO policy, which PyTorch multiplies."""
     from outlap.drivers.policy import PolicyDriver
+    from outlap.training.model_file import load_model
     from outlap.training.run import load_run
 
     run = load_run(folder / "given" / "ppo")
-    return _rows(PolicyDriver.load(run.policy_path, scale_observations=True, speeds=(1.0, 8.0)), folder)
+    model = load_model(run.config, run.policy_path)
+    return _rows(PolicyDriver(model, scale_observations=True, speeds=(1.0, 8.0)), folder)
 
 
 def statistics(folder: Path) -> str:

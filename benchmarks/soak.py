@@ -32,8 +32,7 @@ from outlap.track.catalog import list_tracks, load_track
 from outlap.track.generate import BUILTIN_TRAIN
 from outlap.training.config import TrainingConfig
 from outlap.training.mql import MQLConfig
-from outlap.training.ppo import PPOConfig
-from outlap.training.recurrent_ppo import RecurrentPPOConfig
+from outlap.training.ppo import PPOConfig, RecurrentPPOConfig
 from outlap.training.session import train
 
 TURN = 300.0  # [s] of each training of the second process

@@ -20,8 +20,7 @@ from outlap.errors import OutlapError
 from outlap.track.map_io import write_track
 from outlap.training.config import TrainingConfig
 from outlap.training.mql import MQLConfig
-from outlap.training.ppo import PPOConfig
-from outlap.training.recurrent_ppo import RecurrentPPOConfig
+from outlap.training.ppo import PPOConfig, RecurrentPPOConfig
 from outlap.training.run import Run, create_run
 from synthetic_tracks import ring
 

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from outlap.drivers.classical import FollowTheGap, PurePursuit
 from outlap.drivers.find import UNTRAINED, find_drivers
-from outlap.drivers.follow_the_gap import FollowTheGap
-from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.envs.observations import LINE_AHEAD
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from outlap.drivers.centerline_follower import CenterlineFollower
+from outlap.drivers.classical import CenterlineFollower
 from outlap.drivers.policy import BATCH, PolicyDriver
 from outlap.envs.observations import observation_space
 from outlap.envs.race_config import RaceConfig
@@ -92,23 +91,6 @@ def test_stochastic_actions_are_drawn_from_the_seed_and_from_nothing_else(model,
     np.testing.assert_array_equal(two(0), first)
     assert not np.array_equal(two(1), first)
     assert not np.array_equal(first[0], first[1])
-
-
-def test_a_policy_is_loaded_from_its_file(model, observations, tmp_path: Path):
-    model.save(tmp_path / "policy.zip")
-    loaded = PolicyDriver.load(tmp_path / "policy.zip", scale_observations=True)
-    np.testing.assert_array_equal(
-        loaded.act(observations), PolicyDriver(model, scale_observations=True).act(observations)
-    )
-
-
-def test_files_that_are_no_policy(tmp_path: Path):
-    with pytest.raises(OutlapError, match=r"gone\.zip: no such file"):
-        PolicyDriver.load(tmp_path / "gone.zip", scale_observations=True)
-    (tmp_path / "broken.zip").write_bytes(b"PK\x03\x04 cut off")
-    with pytest.raises(OutlapError, match=r"broken\.zip: cannot be loaded") as error:
-        PolicyDriver.load(tmp_path / "broken.zip", scale_observations=True)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

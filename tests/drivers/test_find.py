@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from outlap.drivers.classical import FollowTheGap, PurePursuit
+from outlap.drivers.driver import PAPER_TERMS, FunctionDriver
 from outlap.drivers.find import UNTRAINED, driver_name, find_drivers
-from outlap.drivers.follow_the_gap import FollowTheGap
-from outlap.drivers.function import PAPER_TERMS, FunctionDriver
 from outlap.drivers.ghost import Ghost
 from outlap.drivers.mlp import MLPDriver
 from outlap.drivers.policy import PolicyDriver
 from outlap.drivers.population import load_population
-from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
 from outlap.training.ppo import PPOConfig
@@ -28,7 +27,7 @@ FIELD_OF_VIEW = 4.7  # [rad]
 TASK = RaceConfig(beams=6, speed_range=(1.0, 5.0), observation=("scan", "vel"), scale_observations=True)
 MODULE = """
 import numpy as np
-from outlap.drivers.pure_pursuit import PurePursuit
+from outlap.drivers.classical import PurePursuit
 
 def straight(observation):
     return np.zeros((len(observation["scan"]), 2))

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from outlap.drivers.function import FunctionDriver
+from outlap.drivers.classical import PurePursuit
+from outlap.drivers.driver import FunctionDriver
 from outlap.drivers.ghost import COLUMNS, PREVIEW, Ghost
-from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.envs.keywords import make_race_vector
 from outlap.envs.observations import observe
 from outlap.envs.race_config import RaceConfig, StartConfig

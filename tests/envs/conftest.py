@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from outlap.drivers.centerline_follower import CenterlineFollower
+from outlap.drivers.classical import CenterlineFollower
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.track.centerline import Centerline
 from outlap.track.track import Track

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from outlap.drivers.classical import PurePursuit
 from outlap.drivers.population import load_population
-from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.envs.keywords import make_race_vector
 from outlap.envs.observations import observe
 from outlap.envs.race_vector_env import RaceVectorEnv

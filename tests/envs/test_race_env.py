@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import RecordEpisodeStatistics
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 
-from outlap.drivers.centerline_follower import CenterlineFollower
+from outlap.drivers.classical import CenterlineFollower
 from outlap.envs.episodes import EPISODE_FIELDS
 from outlap.envs.keywords import make_race
 from outlap.envs.race_env import RaceEnv

@@ -10,9 +10,8 @@ import pandas as pd
 import pytest
 from pandas.testing import assert_frame_equal
 
-from outlap.drivers.centerline_follower import CenterlineFollower
-from outlap.drivers.driver import Driver
-from outlap.drivers.function import FunctionDriver
+from outlap.drivers.classical import CenterlineFollower
+from outlap.drivers.driver import Driver, FunctionDriver
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_env import RaceEnv

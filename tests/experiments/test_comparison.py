@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from outlap.drivers.follow_the_gap import FollowTheGap
+from outlap.drivers.classical import FollowTheGap
 from outlap.errors import OutlapError
 from outlap.evaluation.statistics import wilson_interval
 from outlap.experiments.comparison import Subject, compare, group

@@ -13,7 +13,7 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from outlap.drivers.pure_pursuit import PurePursuit
+from outlap.drivers.classical import PurePursuit
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.protocol import standing_starts

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from outlap.errors import OutlapError
-from outlap.training.device import check_device
+from outlap.training.config import check_device
 from outlap.training.ppo import PPOConfig
 from outlap.training.session import train
 

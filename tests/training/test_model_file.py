@@ -19,8 +19,7 @@ from outlap.errors import OutlapError
 from outlap.training import model_file
 from outlap.training.model_file import load_model
 from outlap.training.mql import MQLConfig
-from outlap.training.ppo import PPOConfig
-from outlap.training.recurrent_ppo import RecurrentPPOConfig
+from outlap.training.ppo import PPOConfig, RecurrentPPOConfig
 from outlap.training.run import Run, load_run
 from outlap.training.session import train
 
@@ -123,9 +122,13 @@ def test_a_file_that_unpacks_to_more_than_a_model_is_refused(run: Run, monkeypat
         load_run("run").driver()
 
 
-def test_a_missing_file_and_one_of_other_networks_are_named(run: Run) -> None:
+def test_a_missing_or_broken_file_and_one_of_other_networks_are_named(run: Run) -> None:
     with pytest.raises(OutlapError, match=r"gone\.zip: no such file"):
         load_model(run.config, "gone.zip")
+    Path("broken.zip").write_bytes(b"PK\x03\x04 cut off")
+    with pytest.raises(OutlapError, match=r"broken\.zip: cannot be loaded as a PPO model") as error:
+        load_model(run.config, "broken.zip")
+    assert "\n" not in str(error.value)
     wider = PPOConfig.model_validate({**PPO, "net_arch": (16,)})
     with pytest.raises(OutlapError, match=r"cannot be loaded as a PPO model: .*size mismatch"):
         load_model(wider, run.policy_path)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from outlap.config import load_config
-from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
 from outlap.evaluation.rollout import evaluate
@@ -57,7 +56,7 @@ def test_an_evaluation_does_not_depend_on_how_many_race_at_once() -> None:
     run = train(SMALL, Path("run"))
     rows = []
     for worlds in (3, 6):
-        driver = PolicyDriver.load(run.policy_path, algorithm=MQL, scale_observations=True)
+        driver = run.driver()
         rows.append(evaluate(driver, ENV, [load_track("ring5")], episodes=6, seed=1, num_worlds=worlds))
     assert rows[0].equals(rows[1])
 
@@ -66,7 +65,7 @@ def test_a_context_needs_the_reward_that_it_is_to_use() -> None:
     config = SMALL.model_copy(update={"env": ENV.model_copy(update={"observation": ("scan", "vel")})})
     run = train(config, Path("run"))  # the environment's wrapper tells it while learning
     assert "previous_reward" in MQL.load(run.policy_path, device="cpu").policy.window_terms
-    driver = PolicyDriver.load(run.policy_path, algorithm=MQL, scale_observations=True)
+    driver = run.driver()
     assert "previous_reward" in driver.observation_terms  # and the evaluation asks for it by name
 
 

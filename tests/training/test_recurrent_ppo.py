@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from outlap.envs.race_config import RaceConfig
-from outlap.training.recurrent_ppo import RecurrentPPOConfig
+from outlap.training.ppo import RecurrentPPOConfig
 from outlap.training.run import load_run
 from outlap.training.session import train
 

@@ -25,8 +25,7 @@ from outlap.mql.mql import MQL
 from outlap.track import load_track
 from outlap.training.config import TrainingConfig
 from outlap.training.mql import MQLConfig
-from outlap.training.ppo import PPOConfig
-from outlap.training.recurrent_ppo import RecurrentPPOConfig
+from outlap.training.ppo import PPOConfig, RecurrentPPOConfig
 from outlap.training.run import Run, load_run
 from outlap.training.session import Progress, train
 

@@ -12,7 +12,7 @@ from outlap.cli.output import CommandResult
 from outlap.errors import OutlapError
 from outlap.processes import in_new_process
 from outlap.provenance import machine
-from outlap.training.device import check_device
+from outlap.training.config import check_device
 
 if TYPE_CHECKING:
     from rich.console import Console

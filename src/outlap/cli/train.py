@@ -19,8 +19,7 @@ from outlap.config import load_config
 from outlap.errors import OutlapError
 from outlap.training.config import TrainingConfig
 from outlap.training.mql import MQLConfig
-from outlap.training.ppo import PPOConfig
-from outlap.training.recurrent_ppo import RecurrentPPOConfig
+from outlap.training.ppo import PPOConfig, RecurrentPPOConfig
 from outlap.training.run import Run, load_run
 
 if TYPE_CHECKING:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from outlap.config import Config
+
+PAPER_TERMS = ("scan", "pose", "vel", "heading")
 
 
 class Driver(ABC):
@@ -56,3 +59,23 @@ class DriverStack(ABC):
     @abstractmethod
     def act(self, which: np.ndarray, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return actions (n, 2) of n cars, given the number of each car's driver, int (n,)."""
+
+
+@dataclass(frozen=True)
+class FunctionDriver(Driver):
+    """Asks a function for the actions of all cars at once: observation terms (n, size) in, actions (n, 2) out."""
+
+    function: Callable[[dict[str, np.ndarray]], Any]
+    name: str
+    observation_terms: tuple[str, ...] = PAPER_TERMS
+
+    @classmethod
+    def of(cls, function: Callable[[dict[str, np.ndarray]], Any]) -> FunctionDriver:
+        """A function as it is: of the paper's terms, or of those that its attribute `observation_terms` names."""
+        terms = getattr(function, "observation_terms", PAPER_TERMS)
+        terms = (terms,) if isinstance(terms, str) else tuple(terms)
+        return cls(function, getattr(function, "__name__", type(function).__name__), terms)
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """See `Driver.act`."""
+        return self.function(observation)

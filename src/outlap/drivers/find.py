@@ -10,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from outlap import plugins
-from outlap.drivers.centerline_follower import CenterlineFollower
-from outlap.drivers.driver import Driver
-from outlap.drivers.follow_the_gap import FollowTheGap
-from outlap.drivers.function import FunctionDriver
+from outlap.drivers.classical import CenterlineFollower, FollowTheGap, PurePursuit
+from outlap.drivers.driver import Driver, FunctionDriver
 from outlap.drivers.ghost import Ghost
 from outlap.drivers.population import MANIFEST, SHIPPED, Split, load_population
-from outlap.drivers.pure_pursuit import PurePursuit
 from outlap.errors import OutlapError
 
 UNTRAINED: dict[str, type[Driver]] = {driver.name: driver for driver in (CenterlineFollower, PurePursuit, FollowTheGap)}

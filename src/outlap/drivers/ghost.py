@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from outlap.drivers.classical import WHEELBASE, speed_action
 from outlap.drivers.driver import Driver
-from outlap.drivers.vehicle_actions import WHEELBASE, speed_action
 from outlap.errors import OutlapError, brief
 from outlap.files import atomic_write
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,7 +9,7 @@ import numpy as np
 
 from outlap.config import Config
 from outlap.drivers.driver import Driver
-from outlap.errors import OutlapError, brief
+from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -75,43 +73,6 @@ class PolicyDriver(Driver):
             term: np.zeros((BATCH, *box.shape), np.float32)  # type: ignore[misc]
             for term, box in space.spaces.items()
         }
-
-    @classmethod
-    def load(
-        cls,
-        path: str | os.PathLike[str],
-        *,
-        algorithm: type[BaseAlgorithm] | None = None,
-        scale_observations: bool,
-        deterministic: bool = True,
-        seed: int = 0,
-        name: str = "policy",
-        speeds: tuple[float, float] | None = None,
-        reward: Config | None = None,
-    ) -> PolicyDriver:
-        """A model of an algorithm, PPO's by default, from the file that Stable-Baselines3 wrote, on the CPU.
-
-        Such a file can run code when it is loaded: load those of people you trust.
-
-        Raises OutlapError for a file that is missing, broken or of another algorithm.
-        """
-        if algorithm is None:
-            from stable_baselines3 import PPO as algorithm
-        if not Path(path).is_file():
-            raise OutlapError(f"{path}: no such file; must be a policy that outlap train wrote")
-        try:
-            model = algorithm.load(Path(path), device="cpu")
-        except Exception as error:  # whatever a broken archive or pickle raises
-            raise OutlapError(f"{path}: cannot be loaded as a {algorithm.__name__} model: {brief(error)}") from error
-        return cls(
-            model,
-            scale_observations=scale_observations,
-            deterministic=deterministic,
-            seed=seed,
-            name=name,
-            speeds=speeds,
-            reward=reward,
-        )
 
     def check(self, space: gym.Space) -> None:
         """See `Driver.check`; the error names the first term that differs from the training's, and how."""

@@ -19,8 +19,8 @@ from outlap.experiments.paper_units import POPULATION, ClippingUnit, RaceUnit, T
 from outlap.experiments.unit import Unit
 from outlap.files import atomic_write, to_json
 from outlap.track.catalog import find_entry, load_track
-from outlap.training.algorithms import ALGORITHMS
 from outlap.training.ppo import PPOConfig
+from outlap.training.run import ALGORITHMS
 
 FIGURE_2, APPENDIX, ALL = "figure-2", "appendix", "all"
 CLIPPING_TASKS = "tracks"  # the task set whose held-out circuits the clip rules are compared on

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 from outlap.config import Config
 from outlap.envs.race_config import RaceConfig
+from outlap.errors import OutlapError, brief
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -49,9 +50,13 @@ class TrainingConfig(Config):
     def model_class(self) -> type[BaseAlgorithm]:
         """The algorithm."""
 
-    @abstractmethod
     def constants(self) -> dict[str, Any]:
-        """What the algorithm is built with, but its networks."""
+        """Return the arguments of the algorithm, except for its networks."""
+        return {
+            **self.model_dump(include={"gamma", "seed", "device"}),
+            "learning_rate": self.schedule(),
+            "stats_window_size": RECENT_EPISODES,
+        }
 
     @abstractmethod
     def network(self) -> dict[str, Any]:
@@ -76,3 +81,20 @@ class TrainingConfig(Config):
         """The learning rate as a function of the progress remaining, 1 … 0."""
         rate = self.learning_rate
         return (lambda remaining: rate * remaining) if self.learning_rate_decay else rate
+
+
+def check_device(device: str) -> None:
+    """Raises OutlapError for a device that PyTorch does not know, or that this machine does not have.
+
+    Stable-Baselines3 takes the CPU then, and says nothing.
+    """
+    import torch
+
+    if device == "auto":  # a GPU if there is one
+        return
+    try:
+        torch.empty(1, device=device).cpu()
+    except Exception as error:  # RuntimeError, AssertionError, NotImplementedError: that hangs on the device
+        raise OutlapError(
+            f"device is {device!r}: {brief(error)}; must be cpu, auto, or a device that PyTorch has here, such as cuda"
+        ) from error

@@ -10,7 +10,7 @@ from tyro.conf import arg
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.rewards import RewardConfig
 from outlap.mql.config import TD3Config
-from outlap.training.config import RECENT_EPISODES, TrainingConfig
+from outlap.training.config import TrainingConfig
 from outlap.training.ppo import PPOConfig
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class MQLConfig(TrainingConfig, TD3Config):
     total_steps: Annotated[int, arg(aliases=["--steps"])] = Field(default=3_500_000, gt=0)  # actions, all worlds
     preset: Literal["fast", "paper"] = "fast"  # networks, see mql.networks
     history: int = Field(default=10, ge=1)  # steps that the context is made of
-    uses_reward: bool = True  # whether the context is told the rewards, which a car does not have
+    uses_reward: bool = True  # whether the context observes rewards, which a car does not have
     uses_context: bool = True  # without it, it is TD3
     buffer_size: int = Field(default=1_000_000, ge=1)  # steps, all worlds together
     learning_starts: int = Field(default=20_000, ge=0)  # actions at random before the first update
@@ -43,8 +43,8 @@ class MQLConfig(TrainingConfig, TD3Config):
 
     @field_validator("env")
     @classmethod
-    def _told_its_rewards(cls, env: RaceConfig) -> RaceConfig:
-        """MQL sees them in any case: as an observation of the environment they are scaled in training as in a race."""
+    def _observe_rewards(cls, env: RaceConfig) -> RaceConfig:
+        # As an observation of the environment, rewards are scaled in a training as in a race.
         if "previous_reward" in env.observation:
             return env
         return env.model_copy(update={"observation": (*env.observation, "previous_reward")})
@@ -62,28 +62,16 @@ class MQLConfig(TrainingConfig, TD3Config):
     def constants(self) -> dict[str, Any]:
         """See `TrainingConfig`."""
         return {
-            "learning_rate": self.schedule(),
-            "buffer_size": self.buffer_size,
-            "learning_starts": self.learning_starts,
-            "batch_size": self.batch_size,
-            "gamma": self.gamma,
+            **super().constants(),
+            **self.model_dump(include={"buffer_size", "learning_starts", "batch_size", "n_steps"}),
             "train_freq": 1,
             "gradient_steps": self.updates_per_step,
-            "n_steps": self.n_steps,
-            "td3": TD3Config(**{name: getattr(self, name) for name in TD3Config.model_fields}),
-            "stats_window_size": RECENT_EPISODES,
-            "seed": self.seed,
-            "device": self.device,
+            "td3": TD3Config(**self.model_dump(include=set(TD3Config.model_fields))),
         }
 
     def network(self) -> dict[str, Any]:
         """See `TrainingConfig`."""
-        return {
-            "preset": self.preset,
-            "history": self.history,
-            "uses_reward": self.uses_reward,
-            "uses_context": self.uses_context,
-        }
+        return self.model_dump(include={"preset", "history", "uses_reward", "uses_context"})
 
     def model_class(self) -> type[MQL]:
         """See `TrainingConfig`."""

@@ -1,4 +1,4 @@
-"""PPO with domain randomization: Stable-Baselines3's PPO on the batched environment."""
+"""PPO with domain randomization, and RecurrentPPO: those of Stable-Baselines3 on the batched environment."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from pydantic import Field
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.simulator.vehicle import LidarParams, VehicleParams
-from outlap.training.config import RECENT_EPISODES, TrainingConfig
+from outlap.training.config import TrainingConfig
 
 if TYPE_CHECKING:
+    from sb3_contrib import RecurrentPPO
     from stable_baselines3.common.base_class import BaseAlgorithm
+
+CONSTANTS = {
+    "n_steps", "batch_size", "n_epochs", "gae_lambda", "clip_range", "ent_coef", "vf_coef", "max_grad_norm",
+}  # fmt: skip
 
 
 class PPOConfig(TrainingConfig):
@@ -47,21 +52,7 @@ class PPOConfig(TrainingConfig):
 
     def constants(self) -> dict[str, Any]:
         """See `TrainingConfig`."""
-        return {
-            "learning_rate": self.schedule(),
-            "n_steps": self.n_steps,
-            "batch_size": self.batch_size,
-            "n_epochs": self.n_epochs,
-            "gamma": self.gamma,
-            "gae_lambda": self.gae_lambda,
-            "clip_range": self.clip_range,
-            "ent_coef": self.ent_coef,
-            "vf_coef": self.vf_coef,
-            "max_grad_norm": self.max_grad_norm,
-            "stats_window_size": RECENT_EPISODES,
-            "seed": self.seed,
-            "device": self.device,
-        }
+        return super().constants() | self.model_dump(include=CONSTANTS)
 
     def network(self) -> dict[str, Any]:
         """See `TrainingConfig`: policy and value function."""
@@ -78,3 +69,23 @@ class PPOConfig(TrainingConfig):
         from stable_baselines3 import PPO
 
         return PPO
+
+
+class RecurrentPPOConfig(PPOConfig):
+    """A training of PPO whose policy and value function share what an LSTM remembers of the episode."""
+
+    policy_name = "MultiInputLstmPolicy"
+
+    algorithm: Literal["recurrent-ppo"] = "recurrent-ppo"  # type: ignore[assignment]
+    lstm_hidden: int = Field(default=64, ge=1)
+
+    def network(self) -> dict[str, Any]:
+        """See `TrainingConfig`."""
+        memory = {"lstm_hidden_size": self.lstm_hidden, "shared_lstm": True, "enable_critic_lstm": False}
+        return {**super().network(), **memory}
+
+    def model_class(self) -> type[RecurrentPPO]:
+        """See `TrainingConfig`."""
+        from sb3_contrib import RecurrentPPO
+
+        return RecurrentPPO

@@ -27,16 +27,19 @@ from outlap.files import atomic_write, to_json
 from outlap.provenance import provenance
 from outlap.track.catalog import name_key
 from outlap.track.generate import BUILTIN_TRAIN
-from outlap.training.algorithms import ALGORITHMS
-from outlap.training.config import TrainingConfig
-from outlap.training.device import check_device
+from outlap.training.config import TrainingConfig, check_device
 from outlap.training.model_file import load_model
+from outlap.training.mql import MQLConfig
+from outlap.training.ppo import PPOConfig, RecurrentPPOConfig
 
 if TYPE_CHECKING:
     from outlap.drivers.policy import PolicyDriver
     from outlap.mql.mql import MQL
 
 log = logging.getLogger(__name__)
+
+ALGORITHMS: dict[str, type[TrainingConfig]] = {"ppo": PPOConfig, "recurrent-ppo": RecurrentPPOConfig, "mql": MQLConfig}
+"""The algorithms of `outlap train`, by the name in their configuration."""
 
 
 @dataclass(frozen=True)

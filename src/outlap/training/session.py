@@ -17,8 +17,7 @@ from outlap.files import remove_partials
 from outlap.track.catalog import load_tracks
 from outlap.training.callback import Progress, Stopwatch, TrainingCallback
 from outlap.training.checkpoints import check_finite, newest_model, reseed, save_checkpoint, save_progress
-from outlap.training.config import TrainingConfig
-from outlap.training.device import check_device
+from outlap.training.config import TrainingConfig, check_device
 from outlap.training.run import Run, create_run
 
 
