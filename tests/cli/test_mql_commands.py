@@ -153,7 +153,7 @@ def test_wrong_arguments_are_one_line(run: Path, capfd: pytest.CaptureFixture[st
         (["adapt", "run", "--clip", "tight"], "clip"),
         (["adapt", "run", "--tracks", "nowhere"], "no track is called 'nowhere'"),
         (["train", "ppo", "--resume", "run"], "was trained with mql, not ppo"),
-        (["benchmark", "mql", "--beams", "8"], "go together"),
+        (["benchmark", "mql", "--batch", "1"], "--batch must be at least 2"),
     ):
         capfd.readouterr()
         assert main(words) == 2
