@@ -2,7 +2,8 @@
 
 TD3 as it is mostly written, with the networks of the preset `paper`: the critics' step, and at every other update the
 actor's, each with a forward pass and a gradient of its own that trains the context too; `torch.nn.GRU`, two critics one
-after the other, windows gathered by NumPy for both ends of a transition. 540 beams, batch 256. Episodes have no ends here, and the replay is 8,192 steps: both save it time.
+after the other, windows gathered by NumPy for both ends of a transition. 540 beams, batch 256. Episodes have no ends
+here, and the replay is 8,192 steps: both save it time.
 
     python benchmarks/straightforward.py
 """
