@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,11 +33,7 @@ class Config(BaseModel):
     """Base of every configuration: frozen, no unknown fields, no NaN or infinity, defaults validated too."""
 
     model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        validate_default=True,
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
     @field_validator("*", mode="before")
@@ -53,10 +50,10 @@ ConfigT = TypeVar("ConfigT", bound=BaseModel)
 
 
 def _finite(value: Any) -> float:
-    # bool is an int in Python, but `mu: yes` in a file is a mistake and not a friction of 1.
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise ValueError("must be a number or a range {min: a, max: b}")
     try:
+        # bool is an int in Python, but `mu: yes` in a file is a mistake and not a friction of 1.
+        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            raise ValueError
         number = float(value)  # from text too: YAML 1.1 reads `1e-3` as a string
     except ValueError:
         raise ValueError("must be a number or a range {min: a, max: b}") from None
@@ -85,9 +82,7 @@ def _as_mapping(value: Any) -> Any:
 
 
 Number = Annotated[
-    float | tuple[float, float],
-    BeforeValidator(_number_or_range),
-    PlainSerializer(_as_mapping, return_type=Any),
+    float | tuple[float, float], BeforeValidator(_number_or_range), PlainSerializer(_as_mapping, return_type=Any)
 ]
 """A value, or a range (min, max) from which one is drawn anew at each reset.
 
@@ -107,43 +102,35 @@ class Interval:
 
     def __call__(self, value: float | tuple[float, float]) -> float | tuple[float, float]:
         low, high = bounds(value)
-        limits = [
-            (">", self.above, lambda limit: low > limit),
-            (">=", self.at_least, lambda limit: low >= limit),
-            ("<", self.below, lambda limit: high < limit),
-            ("<=", self.at_most, lambda limit: high <= limit),
+        rules = [
+            (operator.gt, low, ">", self.above),
+            (operator.ge, low, ">=", self.at_least),
+            (operator.lt, high, "<", self.below),
+            (operator.le, high, "<=", self.at_most),
         ]
-        set_ones = [(f"{sign} {limit}", holds(limit)) for sign, limit, holds in limits if limit is not None]
-        if not all(held for _, held in set_ones):
-            raise ValueError("must be " + " and ".join(rule for rule, _ in set_ones))
+        if not all(limit is None or holds(end, limit) for holds, end, _, limit in rules):
+            wanted = " and ".join(f"{sign} {limit}" for _, _, sign, limit in rules if limit is not None)
+            raise ValueError(f"must be {wanted}")
         return value
 
 
-def bounded(
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
-) -> AfterValidator:
-    """A limit for a `Number`, on both ends where it is a range: `mu: Annotated[Number, bounded(above=0)]`."""
-    return AfterValidator(Interval(above, at_least, below, at_most))
+def bounded(**limits: float) -> AfterValidator:
+    """Limit a `Number`, at both ends if it is a range: `mu: Annotated[Number, bounded(above=0)]`; see `Interval`."""
+    return AfterValidator(Interval(**limits))
 
 
 def widest(cls: type[BaseModel], field: str) -> tuple[float, float]:
-    """The ends of what a field of type `Number` may be; infinite where it has no limit."""
-    low, high = -math.inf, math.inf
+    """Return the limits of a field of type `Number`; infinite where it has none."""
+    lows, highs = [-math.inf], [math.inf]
     for each in cls.model_fields[field].metadata:
         if isinstance(each, AfterValidator) and isinstance(each.func, Interval):
-            lows = (low, each.func.above, each.func.at_least)
-            highs = (high, each.func.below, each.func.at_most)
-            low = max(limit for limit in lows if limit is not None)
-            high = min(limit for limit in highs if limit is not None)
-    return low, high
+            lows += [limit for limit in (each.func.above, each.func.at_least) if limit is not None]
+            highs += [limit for limit in (each.func.below, each.func.at_most) if limit is not None]
+    return max(lows), min(highs)
 
 
 def bounds(number: float | tuple[float, float]) -> tuple[float, float]:
-    """The smallest and the largest value of a `Number`; a fixed value is both."""
+    """Return the smallest and the largest value of a `Number`; a fixed value is both."""
     return number if isinstance(number, tuple) else (number, number)
 
 
@@ -157,7 +144,7 @@ def load_config(cls: type[ConfigT], path: str | os.PathLike[str]) -> ConfigT:
 
 
 def read_yaml(path: str | os.PathLike[str]) -> Any:
-    """What a YAML file holds, nothing being an empty mapping; loaded safely.
+    """Load a YAML file safely; an empty file is an empty mapping.
 
     Raises:
         OutlapError: one line with the file and what is wrong with it.
@@ -199,7 +186,7 @@ def validate(cls: type[ConfigT], content: Any, source: str) -> ConfigT:
 
 
 def explain(error: ValidationError, cls: type[BaseModel] | None = None, prefix: str = "") -> str:
-    """The first problem of a pydantic error as one line: field, value and what would be right.
+    """Return the first problem of a pydantic error as one line: field, value and what would be right.
 
     Args:
         error: what pydantic raised.
@@ -211,31 +198,28 @@ def explain(error: ValidationError, cls: type[BaseModel] | None = None, prefix: 
     problem = next((each for each in problems if each["type"] == "extra_forbidden"), problems[0])
     location = problem["loc"]
     field = (prefix + ".".join(str(part) for part in location)).rstrip(".") or "the configuration"
-    context = problem.get("ctx", {})
+    context, given = problem.get("ctx", {}), f"{field} is {_short(problem['input'])}"
     match problem["type"]:
         case "extra_forbidden":
             line = f"{field} is not a known field{_hint(cls, location)}"
         case "missing":
             line = f"{field} is missing; it must be given"
+        case "value_error" if isinstance(problem["input"], BaseModel):  # the error names the field that is wrong
+            line = f"{field}: {context['error']}"
         case "value_error":
-            whole = isinstance(problem["input"], BaseModel)  # of which one field is wrong, as the error says
-            line = (
-                f"{field}: {context['error']}"
-                if whole
-                else f"{field} is {_short(problem['input'])}; {context['error']}"
-            )
+            line = f"{given}; {context['error']}"
         case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal" as kind:
             sign = (">" if kind.startswith("greater") else "<") + ("=" if kind.endswith("equal") else "")
-            line = f"{field} is {_short(problem['input'])}; must be {sign} {next(iter(context.values()))}"
+            line = f"{given}; must be {sign} {next(iter(context.values()))}"
         case "model_type":
-            line = f"{field} is {_short(problem['input'])}; must be a mapping of fields to values"
+            line = f"{given}; must be a mapping of fields to values"
         case "literal_error" | "enum":
             close = difflib.get_close_matches(str(problem["input"]), context["expected"].split("'")[1::2], 1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
-            line = f"{field} is {_short(problem['input'])}; must be {context['expected']}{hint}"
+            line = f"{given}; must be {context['expected']}{hint}"
         case _:
             rule = problem["msg"].replace("Input should ", "must ", 1)
-            line = f"{field} is {_short(problem['input'])}; {rule[0].lower()}{rule[1:]}"
+            line = f"{given}; {rule[0].lower()}{rule[1:]}"
     more = len(problems) - 1
     return " ".join(line.split()) + (f" (and {more} more)" if more else "")
 

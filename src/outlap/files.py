@@ -17,7 +17,7 @@ from outlap.errors import OutlapError
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A path beside `path` to write to, renamed into place once the block is done; parent folders are made.
+    """Yield a path beside `path` to write to, renamed into place once the block is done; parent folders are made.
 
     A reader sees the old content or the new one. If the block fails, nothing is left of it.
     """
@@ -46,7 +46,7 @@ def make_folder(folder: Path) -> Path:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove what writers that were killed have left in a folder and those below it; nothing of writers at work."""
+    """Remove the partial files of killed writers in a folder and those below it; keep those of running writers."""
     for path in folder.rglob(".*.partial*"):
         found = re.search(r"\.(\d+)\.partial", path.name)
         if found and not _is_running(int(found[1])):

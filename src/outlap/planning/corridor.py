@@ -27,7 +27,7 @@ BODY_STEP = 0.03  # [m] between points of the car's body
 
 
 def corridor(track: Track, path: ClosedPath, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """How far a disc may move sideways from each point of a line.
+    """Return how far a disc may move sideways from each point of a line.
 
     What counts is the map; the centreline's widths only say where a track ends that has no wall there.
 
@@ -56,7 +56,7 @@ def corridor(track: Track, path: ClosedPath, radius: float) -> tuple[np.ndarray,
 
 
 def wall_margin(track: Track, path: ClosedPath, body: CarLimits) -> np.ndarray:
-    """The distance from the car's body to the nearest wall, all along a line: (n,) [m], negative where it is in one."""
+    """Return the distance from the car's body to the nearest wall along a line: (n,) [m], negative inside a wall."""
     half_length, half_width = 0.5 * body.length, 0.5 * body.width
     step = min(BODY_STEP, track.resolution)  # no pixel is stepped over
     lengthwise = np.linspace(-half_length, half_length, math.ceil(body.length / step) + 1)

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 def cached_line(
     track: Track, limits: CarLimits, method: Method = "min-time", margin: float = DEFAULT_MARGIN
 ) -> PlannedLine:
-    """`plan_line`, or what it found before for the same walls, centreline, limits and margin."""
+    """Return the line of `plan_line`, from the cache if the same walls, centreline, limits and margin are in it."""
 
     def plan() -> dict[str, np.ndarray]:
         log.info("%s: planning the %s line; it is kept for the next time", track.name, method)
@@ -71,7 +71,7 @@ def path_arrays(path: ClosedPath, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def path_of(saved: Mapping[str, np.ndarray], prefix: str = "") -> ClosedPath:
-    """The inverse of `path_arrays`."""
+    """Return the path that `path_arrays` was given."""
     columns = saved[f"{prefix}path"]
     points, heading, curvature = columns[:, :2].copy(), columns[:, 2].copy(), columns[:, 3].copy()
     return ClosedPath(points, heading, curvature, float(saved[f"{prefix}length"]))

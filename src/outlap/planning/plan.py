@@ -58,7 +58,7 @@ def plan_line(
     margin: float = DEFAULT_MARGIN,
     friction: FrictionMap | None = None,
 ) -> PlannedLine:
-    """The line that a method finds, with the fastest speeds on it.
+    """Return the line that a method finds, with the fastest speeds on it.
 
     Args:
         track: to drive on.
@@ -139,7 +139,7 @@ def _least_time(
 
 
 def _nearest(track: Track, path: ClosedPath, limits: CarLimits) -> float:
-    """How near a car on a line comes to the walls [m]."""
+    """Return how near a car on a line comes to the walls [m]."""
     return float(wall_margin(track, path.resampled(2.0 * SPACING), limits).min())
 
 
