@@ -6,6 +6,7 @@ The colours are Okabe and Ito's palette, which readers with any colour vision ca
 from __future__ import annotations
 
 import os
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ COLOURS = (BLUE, VERMILION, "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000
 WALL_GREY, INK = "#BDBDBD", "#222222"
 
 WIDTH = 7.0  # [inch] of the figure: the text width of a page
+TITLE_WIDTH = 90  # characters
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -31,6 +33,11 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def entitle(figure: Figure, title: str) -> None:
+    """Set the title of a figure, in as many lines as it needs."""
+    figure.suptitle(textwrap.fill(title, TITLE_WIDTH), x=0.01, ha="left", fontsize=10, fontweight="bold")
 
 
 def finish(figure: Figure, path: str | os.PathLike[str] | None = None) -> Figure:

@@ -188,11 +188,7 @@ class CarDriver:
         return ""
 
     def _mistrust(
-        self,
-        velocity: tuple[float, float, float],
-        scan_age: float,
-        odometry_age: float,
-        steering_angle: float | None,
+        self, velocity: tuple[float, float, float], scan_age: float, odometry_age: float, steering_angle: float | None
     ) -> str:
         """Why odometry, ages and the steering angle are not believed; empty where they are."""
         limits = self.limits

@@ -251,11 +251,7 @@ def _policy(policy: Any) -> Remembering:
 
 
 def compare(
-    run: Run,
-    driver: CarDriver,
-    steps: int = 1000,
-    seed: int = 0,
-    on_step: Callable[[int], None] | None = None,
+    run: Run, driver: CarDriver, steps: int = 1000, seed: int = 0, on_step: Callable[[int], None] | None = None
 ) -> tuple[float, float]:
     """How far an exported policy is from the run's own, while that one races in its training's environment.
 

@@ -15,6 +15,7 @@ OUTCOMES = (CRASH, FINISHED, TIMEOUT, STALLED)
 MEANS = (
     "completed_laps", "lap_time_s", "lap_time_ratio", "mean_speed_mps", "progress_m", "episode_steps", "episode_return",
 )  # fmt: skip
+METHOD_MEANS = ("crash_rate", "mean_speed_mps", "lap_time_ratio", "progress_m")
 
 
 def summarise(rows: pd.DataFrame) -> dict[str, Any]:
@@ -50,33 +51,17 @@ def summarise_methods(rows: pd.DataFrame) -> dict[str, Any]:
         method → {"all": …, "tracks": {name: …}}, each with `crash_rate`, `mean_speed_mps`, `lap_time_ratio` (of the
         episodes with a lap) and `progress_m` as {mean, sd, low, high}; `before` has one seed, and no interval.
     """
-    columns = {name: rows[name].to_numpy() for name in ("method", "track", "adaptation_seed")}
-    values = {
-        "crash_rate": (rows["outcome"] == CRASH).to_numpy(np.float64),
-        "mean_speed_mps": rows["mean_speed_mps"].to_numpy(np.float64),
-        "lap_time_ratio": rows["lap_time_ratio"].to_numpy(np.float64),
-        "progress_m": rows["progress_m"].to_numpy(np.float64),
+    rows = rows.assign(crash_rate=(rows["outcome"] == CRASH).astype(float))
+
+    def of(chosen: pd.DataFrame) -> dict[str, Any]:
+        seeds = chosen.groupby("adaptation_seed")[list(METHOD_MEANS)].mean()  # of what is known
+        counts = {"episodes": len(chosen), "seeds": len(seeds)}
+        return {**counts, **{name: _mean(seeds[name].to_numpy(np.float64)) for name in METHOD_MEANS}}
+
+    return {
+        method: {"all": of(mine), "tracks": {track: of(part) for track, part in mine.groupby("track", sort=False)}}
+        for method, mine in rows.groupby("method", sort=False)
     }
-
-    def of(chosen: np.ndarray) -> dict[str, Any]:
-        seeds = columns["adaptation_seed"]
-        each = [chosen & (seeds == seed) for seed in np.unique(seeds[chosen])]
-        means = {name: np.array([_mean_known(value[one]) for one in each]) for name, value in values.items()}
-        counts = {"episodes": int(chosen.sum()), "seeds": len(each)}
-        return {**counts, **{name: _mean(mean) for name, mean in means.items()}}
-
-    summary = {}
-    for method in dict.fromkeys(columns["method"].tolist()):
-        mine = columns["method"] == method
-        tracks = dict.fromkeys(columns["track"][mine].tolist())
-        by_track = {track: of(mine & (columns["track"] == track)) for track in tracks}
-        summary[method] = {"all": of(mine), "tracks": by_track}
-    return summary
-
-
-def _mean_known(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else math.nan
 
 
 def _summary(rows: pd.DataFrame) -> dict[str, Any]:

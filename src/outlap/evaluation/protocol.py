@@ -87,8 +87,7 @@ def episode_task(driver: Driver, config: RaceConfig) -> tuple[RaceConfig, list[D
     opponents: list[Driver] = []
     if config.num_cars > 1:
         opponents = find_drivers(config.opponents, config.field_of_view, config.opponent_split, config.opponent_code)
-    shown = driver.reward or config.reward
-    assert isinstance(shown, RewardConfig)
+    shown = config.reward if driver.reward is None else RewardConfig.model_validate(driver.reward)
     changes: dict[str, Any] = {
         "augment_tracks": False,  # the track that was named, not one of its variants
         "observation": tuple(driver.observation_terms),

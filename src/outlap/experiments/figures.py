@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
@@ -17,12 +16,11 @@ from matplotlib.lines import Line2D
 
 from outlap.evaluation.statistics import estimate_mean, performance_profile
 from outlap.experiments.results import METRICS, TableResult
-from outlap.figure_style import COLOURS, INK, WIDTH, finish, new_figure
+from outlap.figure_style import COLOURS, INK, WIDTH, entitle, finish, new_figure
 
 RULES = {"none": "no clip", "fixed": "fixed clip", "abc": "ABC", "uniform": "β = 1"}
 RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uniform": COLOURS[7]}
 POINTS = 60  # of a learning curve
-TITLE_WIDTH = 90  # characters
 
 
 class Interval(Protocol):
@@ -69,7 +67,7 @@ def draw_intervals(
         mark = Line2D([], [], color=INK, marker="x", linestyle="none", markersize=6, label="the paper")
         figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=7)
     if title:
-        _entitle(figure, title)
+        entitle(figure, title)
     return finish(figure)
 
 
@@ -91,7 +89,7 @@ def draw_profiles(results: Sequence[TableResult], titles: Mapping[str, str], tit
         axes.set_visible(False)
     grid[0, 0].set_ylabel("share above τ", fontsize=8)
     _legend_below(figure, grid[0, 0], 3)
-    _entitle(figure, title)
+    entitle(figure, title)
     return finish(figure)
 
 
@@ -123,7 +121,7 @@ def draw_learning(curves: Mapping[str, Sequence[pd.DataFrame]], title: str) -> F
         axes.set_xlabel("actions [million]", fontsize=8)
     if len(curves) > 1:
         _legend_below(figure, returns, 6)
-    _entitle(figure, title)
+    entitle(figure, title)
     return finish(figure)
 
 
@@ -168,7 +166,7 @@ def draw_figure_2(updates: pd.DataFrame, gradients: pd.DataFrame, title: str) ->
     axes.set_xticks(range(len(RULES)), list(RULES.values()), fontsize=7)
     axes.set_title("gradient variance (mean β 1),\nover that of β = 1", loc="left", fontsize=8)
     _legend_below(figure, grid[0, 0], 3)
-    _entitle(figure, title)
+    entitle(figure, title)
     return finish(figure)
 
 
@@ -198,7 +196,7 @@ def draw_weights(histograms: pd.DataFrame, updates: pd.DataFrame, title: str) ->
     largest.set(yscale="log")
     largest.set_xlabel("replay update (median over adaptations)", fontsize=8)
     largest.legend(fontsize=7, frameon=False)
-    _entitle(figure, title)
+    entitle(figure, title)
     return finish(figure)
 
 
@@ -206,11 +204,6 @@ def _legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     """Draw the legend of one panel below all of them."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
-
-
-def _entitle(figure: Figure, title: str) -> None:
-    """A title in as many lines as it needs."""
-    figure.suptitle(textwrap.fill(title, TITLE_WIDTH), x=0.01, ha="left", fontsize=10, fontweight="bold")
 
 
 def read_learning(folder: Path) -> pd.DataFrame:

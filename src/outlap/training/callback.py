@@ -6,9 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
+import pandas as pd
 from stable_baselines3.common.callbacks import BaseCallback
 
+from outlap.envs.episodes import EPISODE_FIELDS, REWARD_PREFIX
 from outlap.envs.terminations import CRASH
 from outlap.training.checkpoints import begin_episodes, check_finite, reseed, save_progress
 from outlap.training.config import TrainingConfig
@@ -86,12 +87,9 @@ class TrainingCallback(BaseCallback):
 
     def _episode_statistics(self) -> dict[str, float]:
         """Means over recent episodes, by name; empty before the first one ended."""
-        episodes = self.model.ep_info_buffer
-        if not episodes:
+        episodes = pd.DataFrame(list(self.model.ep_info_buffer or ()))
+        if episodes.empty:
             return {}
-        terms = [name for name in episodes[-1] if name.startswith("reward_")]
-        means = {
-            name: float(np.mean([episode[name] for episode in episodes]))
-            for name in ("progress_m", "mean_speed_mps", "completed_laps", "episode_return", *terms)
-        }
-        return {**means, "crash_rate": float(np.mean([episode["outcome"] == CRASH for episode in episodes]))}
+        logged = [name for name in episodes if name in EPISODE_FIELDS or str(name).startswith(REWARD_PREFIX)]
+        means = episodes[logged].mean().dropna()  # a lap time is known after a lap
+        return {**means.to_dict(), "crash_rate": float((episodes["outcome"] == CRASH).mean())}

@@ -40,10 +40,7 @@ DATA = {
 
 
 def load_model(
-    config: TrainingConfig,
-    path: str | os.PathLike[str],
-    environment: SB3VecEnv | None = None,
-    device: str = "cpu",
+    config: TrainingConfig, path: str | os.PathLike[str], environment: SB3VecEnv | None = None, device: str = "cpu"
 ) -> BaseAlgorithm:
     """A model that was trained with a configuration.
 

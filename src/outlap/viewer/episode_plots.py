@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from sklearn.decomposition import PCA
@@ -18,10 +17,10 @@ from outlap.errors import OutlapError
 from outlap.evaluation.frame import SLIP, SPEED, YAW
 from outlap.evaluation.recording import Recording, check_together
 from outlap.evaluation.statistics import estimate_mean
-from outlap.figure_style import COLOURS, INK, WIDTH, finish, new_figure
+from outlap.figure_style import COLOURS, INK, WIDTH, entitle, finish, new_figure
 from outlap.simulator.bicycle import GRAVITY
 from outlap.track.track import Track
-from outlap.viewer.plots import draw_walls, plain, view_of
+from outlap.viewer.plots import draw_map, draw_speeds, height_share, plain
 
 PANELS = 6  # of a figure, at most
 NEAR_THE_LIMIT = 0.8  # of the grip
@@ -41,35 +40,26 @@ def draw_trajectories(
     Raises OutlapError for recordings that cannot be shown together, or an ending that Matplotlib cannot write.
     """
     check_together(recordings, track, PANELS)
-    low, high = view_of(track)
-    columns = 1 if len(recordings) == 1 or (high - low)[0] > 2.5 * (high - low)[1] else 2
+    columns = 1 if len(recordings) == 1 or height_share(track) < 0.4 else 2
     rows = -(-len(recordings) // columns)
-    each = (WIDTH - 1.2) / columns
-    figure = new_figure(WIDTH, min(9.5, 0.3 + rows * (each * (high - low)[1] / (high - low)[0] + 0.6)))
+    figure = new_figure(WIDTH, min(9.5, 0.3 + rows * ((WIDTH - 1.2) / columns * height_share(track) + 0.6)))
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     fastest = max(float(recording.motion[:, EGO, SPEED].max()) for recording in recordings)
     coloured = None
     for axes, recording in zip(grid, recordings, strict=False):
-        draw_walls(axes, track)
-        path_points = recording.path
-        pieces = np.stack([path_points[:-1], path_points[1:]], axis=1)
-        coloured = LineCollection(list(pieces), cmap="viridis", linewidth=1.6, capstyle="round")
-        coloured.set_array(recording.motion[1:, EGO, SPEED])
+        draw_map(axes, track)
+        coloured = draw_speeds(axes, recording.path, recording.motion[1:, EGO, SPEED])
         coloured.set_clim(0.0, fastest)
-        axes.add_collection(coloured)
-        axes.plot(*path_points[0], "o", color=INK, markersize=4)
+        axes.plot(*recording.path[0], "o", color=INK, markersize=4)
         if recording.info.outcome == "crash":
-            axes.plot(*path_points[-1], "X", color="#C00000", markersize=7)
+            axes.plot(*recording.path[-1], "X", color="#C00000", markersize=7)
         outcome = f"{plain(recording.info.title)}: {recording.info.outcome}, {recording.seconds:.1f} s"
         axes.set_title(outcome, loc="left", fontsize=8)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     for axes in grid[len(recordings) :]:
         axes.set_visible(False)
     if coloured is not None:
         figure.colorbar(coloured, ax=grid, label="speed [m/s]", shrink=0.7)
-    figure.suptitle(
-        f"{plain(track.name)}: where they drove, and how fast", x=0.01, ha="left", fontsize=10, fontweight="bold"
-    )
+    entitle(figure, f"{plain(track.name)}: where they drove, and how fast")
     return finish(figure, path)
 
 
@@ -119,7 +109,7 @@ def draw_friction_circles(recordings: Sequence[Recording], path: str | os.PathLi
     for axes in grid[len(recordings) :]:
         axes.set_visible(False)
     grid[0].set_ylabel("along [m/s²]", fontsize=7)
-    figure.suptitle("Use of the friction circle", x=0.01, ha="left", fontsize=10, fontweight="bold")
+    entitle(figure, "Use of the friction circle")
     return finish(figure, path)
 
 
@@ -159,7 +149,7 @@ def draw_lap_time_ratios(rows: pd.DataFrame, path: str | os.PathLike[str] | None
     axes.set_xlabel("lap time / least time (1: the minimum-time lap)", fontsize=8)
     if len(drivers) > 1:
         figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=7)
-    figure.suptitle("Lap times against the fastest possible", x=0.01, ha="left", fontsize=10, fontweight="bold")
+    entitle(figure, "Lap times against the fastest possible")
     return finish(figure, path)
 
 
@@ -200,7 +190,7 @@ def draw_contexts(recordings: Sequence[Recording], path: str | os.PathLike[str] 
         f"right: {np.trace(confused) / len(tasks):.0%}, by chance {1 / len(tasks):.0%}", loc="left", fontsize=8
     )
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=7, markerscale=3)
-    figure.suptitle("What the context tells of the task", x=0.01, ha="left", fontsize=10, fontweight="bold")
+    entitle(figure, "What the context tells of the task")
     return finish(figure, path)
 
 

@@ -37,21 +37,18 @@ def draw_track(track: Track, path: str | os.PathLike[str] | None = None) -> Figu
         OutlapError: the ending of `path` names no format that Matplotlib writes.
     """
     centerline = track.centerline
-    low, high = view_of(track)
-    map_height = min(8.0, max(2.5, (WIDTH - 0.8) * (high[1] - low[1]) / (high[0] - low[0])))
+    map_height = min(8.0, max(2.5, (WIDTH - 0.8) * height_share(track)))
     figure = new_figure(WIDTH, map_height + 2.6)
     map_axes, curvature_axes = figure.subplots(2, 1, height_ratios=(map_height, 1.5))
     marks = np.arange(0.0, centerline.length, _mark_spacing(centerline.length))
 
-    direction = _direction(track)
-    map_axes.set_title(
-        f"{plain(track.name)}: {centerline.length:.0f} m, {direction}", loc="left", fontsize=11, fontweight="bold"
-    )
-    draw_walls(map_axes, track)
+    title = f"{plain(track.name)}: {centerline.length:.0f} m, {_direction(track)}"
+    map_axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
+    draw_map(map_axes, track)
     _draw_line(map_axes, track)
     _draw_marks(map_axes, track, marks)
     _draw_start(figure, map_axes, track)
-    map_axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    map_axes.set(xlabel="x [m]", ylabel="y [m]")
     figure.legend(handles=_legend(track), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
 
     _draw_curvature(curvature_axes, track, marks)
@@ -69,22 +66,18 @@ def draw_raceline(
         path: where to save the figure as well; the ending says in which format (png, pdf, svg).
         lap_time: for the title [s].
     """
-    low, high = view_of(track)
-    map_height = min(8.0, max(2.5, (WIDTH - 1.4) * (high[1] - low[1]) / (high[0] - low[0])))
+    map_height = min(8.0, max(2.5, (WIDTH - 1.4) * height_share(track)))
     figure = new_figure(WIDTH, map_height + 3.2)
     map_axes, speed_axes, grip_axes = figure.subplots(3, 1, height_ratios=(map_height, 1.2, 1.2))
     length = float(line.s[-1] + np.hypot(line.x[0] - line.x[-1], line.y[0] - line.y[-1]))
     lap = "" if lap_time is None else f", lap {lap_time:.2f} s"
     map_axes.set_title(f"{plain(track.name)}: {length:.0f} m{lap}", loc="left", fontsize=11, fontweight="bold")
-    draw_walls(map_axes, track)
-    x, y = np.append(line.x, line.x[0]), np.append(line.y, line.y[0])
-    pieces = np.stack([np.column_stack([x[:-1], y[:-1]]), np.column_stack([x[1:], y[1:]])], axis=1)
-    coloured = LineCollection(list(pieces), cmap="viridis", linewidth=1.6, capstyle="round")
-    coloured.set_array(line.speed)
-    map_axes.add_collection(coloured)
+    draw_map(map_axes, track)
+    points = np.column_stack([line.x, line.y])
+    coloured = draw_speeds(map_axes, np.vstack([points, points[:1]]), line.speed)
     figure.colorbar(coloured, ax=map_axes, label="speed [m/s]", shrink=0.8)
     _draw_start(figure, map_axes, track)
-    map_axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    map_axes.set(xlabel="x [m]", ylabel="y [m]")
     speed_axes.plot(line.s, line.speed, color=BLUE, linewidth=1.0)
     speed_axes.set(ylabel="speed [m/s]", xlim=(0.0, length), ylim=(0.0, 1.05 * float(line.speed.max())))
     grip_axes.plot(line.s, line.acceleration, color=BLUE, linewidth=0.9, label="along")
@@ -101,7 +94,13 @@ def plain(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def view_of(track: Track) -> tuple[np.ndarray, np.ndarray]:
+def height_share(track: Track) -> float:
+    """Return the height of a track's map, as drawn, divided by its width."""
+    width, height = np.subtract(*_view(track)[::-1])
+    return float(height / width)
+
+
+def _view(track: Track) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of what is shown [m]: the track, not the empty rest of its map."""
     points = track.centerline.points
     half_width = max(track.centerline.width_left.max(), track.centerline.width_right.max())
@@ -120,8 +119,8 @@ def _direction(track: Track) -> str:
     return "anticlockwise" if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0 else "clockwise"
 
 
-def draw_walls(axes: Axes, track: Track) -> None:
-    """The walls of a track, on axes in metres."""
+def draw_map(axes: Axes, track: Track) -> None:
+    """Draw the walls of a track, on axes in metres that show all of it."""
     block = -(-max(track.occupancy.shape) // MAX_MAP_PIXELS)
     coarse = track.coarse(block)
     rows, cols = coarse.shape
@@ -136,6 +135,16 @@ def draw_walls(axes: Axes, track: Track) -> None:
         transform=Affine2D().rotate(yaw).translate(x, y) + axes.transData,
         interpolation="none",
     )
+    (left, bottom), (right, top) = _view(track)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+
+
+def draw_speeds(axes: Axes, points: np.ndarray, speed: np.ndarray) -> LineCollection:
+    """Draw a path of points (n, 2) [m] whose n - 1 pieces are coloured by speed [m/s]."""
+    coloured = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), cmap="viridis", capstyle="round")
+    coloured.set(array=speed, linewidth=1.6)
+    axes.add_collection(coloured)
+    return coloured
 
 
 def _draw_line(axes: Axes, track: Track) -> None:
@@ -191,15 +200,7 @@ def _draw_start(figure: Figure, axes: Axes, track: Track) -> None:
 
 def _legend(track: Track) -> list[Artist]:
     entries: list[Artist] = [
-        Line2D(
-            [],
-            [],
-            color=BLUE,
-            marker="o",
-            markersize=3,
-            linewidth=1,
-            label="centreline, metres from the start",
-        ),
+        Line2D([], [], color=BLUE, marker="o", markersize=3, linewidth=1, label="centreline, metres from the start"),
         Line2D([], [], color=INK, linewidth=2.5, label="start line, direction"),
         Patch(facecolor=WALL_GREY, label="wall"),
     ]
@@ -225,14 +226,6 @@ def _draw_curvature(axes: Axes, track: Track, marks: np.ndarray) -> None:
     )
     axes.grid(axis="x", color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
-    for height, turn in ((0.97, "left"), (0.03, "right")):
-        axes.text(
-            0.995,
-            height,
-            turn,
-            transform=axes.transAxes,
-            ha="right",
-            va="top" if height > 0.5 else "bottom",
-            fontsize=8,
-            color=INK,
-        )
+    beside = {"ha": "right", "fontsize": 8, "color": INK, "transform": axes.transAxes}
+    axes.text(0.995, 0.97, "left", va="top", **beside)
+    axes.text(0.995, 0.03, "right", va="bottom", **beside)
