@@ -88,7 +88,7 @@ class Evaluate(RaceFlags, LongCommand):
         return with_recordings(result, folder, tracks[0])
 
     def _evaluate(self, found: Subject, env: RaceConfig, tracks: Sequence[Track], folder: Path) -> Mapping[str, Any]:
-        from outlap.evaluation.evaluate import evaluate_into
+        from outlap.evaluation.results import evaluate_into
 
         run, begun = found.run, time.monotonic()
         with self.progress("evaluating", self.episodes * len(tracks), "episodes") as update:

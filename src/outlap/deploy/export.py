@@ -29,11 +29,11 @@ from outlap.envs.observations import scale_of
 from outlap.errors import OutlapError
 from outlap.files import atomic_write
 from outlap.mql.networks import PREVIOUS_REWARD
+from outlap.mql.policies import MQLPolicy
 from outlap.training.model_file import load_model
 
 if TYPE_CHECKING:
     from outlap.deploy.car_driver import CarDriver
-    from outlap.mql.policies import MQLPolicy
     from outlap.training.run import Run
 
 PREVIOUS_ACTION = "previous_action"
@@ -55,7 +55,7 @@ def export_policy(run: Run, path: str | os.PathLike[str]) -> dict[str, Any]:
     model = load_model(run.config, run.policy_path)
     observed = model.observation_space
     assert isinstance(observed, gym.spaces.Dict)
-    reads_reward = getattr(model.policy, "uses_reward", True)
+    reads_reward = not isinstance(model.policy, MQLPolicy) or model.policy.uses_reward
     space = gym.spaces.Dict({name: observed[name] for name in observed if reads_reward or name != PREVIOUS_REWARD})
     facts = describe(run, space)
     graph = Graph(_policy(model.policy), space, facts, run.config.env.scale_observations).eval()
@@ -243,8 +243,6 @@ class WithContext(Remembering):
 
 
 def _policy(policy: Any) -> Remembering:
-    from outlap.mql.policies import MQLPolicy
-
     if isinstance(policy, MQLPolicy):
         return WithContext(policy)
     return Recurrent(policy) if hasattr(policy, "lstm_actor") else FeedForward(policy)

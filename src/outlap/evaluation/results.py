@@ -1,18 +1,78 @@
-"""The folder that an evaluation leaves behind."""
+"""Evaluate a driver into a folder: rows, summary, and the record of what made them."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from outlap.drivers.driver import Driver
+from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
+from outlap.evaluation.metrics import summarise
+from outlap.evaluation.rollout import EvaluationProgress, evaluate
 from outlap.files import atomic_write, make_folder, to_json
+from outlap.provenance import provenance
+from outlap.track.track import Track
 
 ROWS, UPDATES, SUMMARY, RECORD = "episodes.parquet", "updates.parquet", "summary.json", "evaluation.json"
+
+
+def evaluate_into(
+    folder: Path,
+    driver: Driver,
+    env: RaceConfig,
+    tracks: Sequence[Track],
+    *,
+    episodes: int,
+    seed: int,
+    num_worlds: int,
+    trained_on: Sequence[str] = (),
+    facts: Mapping[str, Any] | None = None,
+    on_progress: Callable[[EvaluationProgress], None] | None = None,
+) -> dict[str, Any]:
+    """Evaluate a driver, write rows, summary and record to a folder, and return the summary.
+
+    Args:
+        folder: new or empty; removed again if the evaluation does not finish.
+        driver: to evaluate.
+        env: the task, see `protocol.standing_starts`.
+        tracks: to evaluate on.
+        episodes: on each track.
+        seed, num_worlds, on_progress: see `rollout.evaluate`.
+        trained_on: the names of those tracks that the driver was trained on; the results name them.
+        facts: added to the record.
+
+    Raises OutlapError for a folder that is not empty or cannot be written, and what `evaluate` raises.
+    """
+    prepare_folder(folder)
+    begun = time.monotonic()
+    try:
+        rows = evaluate(driver, env, tracks, episodes, seed, num_worlds, on_progress)
+    except BaseException:
+        with suppress(OSError):
+            folder.rmdir()  # it is empty
+        raise
+    summary = {**summarise(rows), "trained_on": list(trained_on)}
+    record = {
+        **provenance(),
+        "seconds": round(time.monotonic() - begun, 1),
+        "driver": driver.name,
+        "tracks": {track.name: track.fingerprint for track in tracks},
+        "trained_on": list(trained_on),
+        "episodes_per_track": episodes,
+        "seed": seed,
+        "worlds": num_worlds,
+        **(facts or {}),
+        "env": env.model_dump(mode="json"),
+    }
+    save_results(folder, rows, summary, record)
+    return {**summary, "driver": driver.name, "folder": folder}
 
 
 def prepare_folder(folder: Path) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from outlap.errors import OutlapError
 from outlap.files import replacing
+from outlap.mql import collector
+from outlap.mql.mql import MQL
 from outlap.training.config import TrainingConfig
 from outlap.training.model_file import load_model
 from outlap.training.run import Run
@@ -29,19 +31,18 @@ class TrainingDiverged(OutlapError):
     """A network's parameters are NaN or huge."""
 
 
-def save_checkpoint(run: Run, model: Any, name: str, replay_name: str) -> Path:
+def save_checkpoint(run: Run, model: Any, name: str, replay_name: str) -> None:
     """Write a model, and its replay buffer before it: no model is ever without the buffer that belongs to it.
 
     Both are written beside their places and renamed there. Then the oldest checkpoints and other replays are removed.
     """
     path, replay = run.folder / name, run.folder / replay_name
-    if getattr(model, "replay_buffer", None) is not None:
+    if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
         model.save_replay_buffer(replay)
     with replacing(path) as partial:
         model.save(partial)
-    for old in (*run.checkpoints()[CHECKPOINTS_KEPT:], *(each for each in run.replays() if each != replay)):
+    for old in {*run.checkpoints()[CHECKPOINTS_KEPT:], *run.replays()} - {replay}:
         old.unlink(missing_ok=True)
-    return path
 
 
 def save_progress(run: Run, model: BaseAlgorithm, seconds: float) -> None:
@@ -103,8 +104,5 @@ def begin_episodes(model: Any) -> None:
     """Begin an episode in every world, as `learn` does when it resumes a training."""
     model._last_obs = model.env.reset()
     model._last_episode_starts = np.ones(model.n_envs, bool)
-    replay = getattr(model, "replay_buffer", None)
-    if replay is not None:
-        from outlap.mql import collector
-
-        collector.begin_episodes(replay, model.env, model._last_obs)
+    if isinstance(model, MQL):
+        collector.begin_episodes(model.replay_buffer, model.env, model._last_obs)

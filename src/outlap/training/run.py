@@ -124,10 +124,6 @@ class Run:
             steps=steps, seconds=round(seconds, 1), steps_per_second=round(steps / max(seconds, 1e-9)), **facts
         )
 
-    def begin_session(self) -> None:
-        """Note in run.json that the training goes on, by which command and where."""
-        self.write_record(resumed=[*self.record().get("resumed", []), provenance()])
-
     def record(self) -> dict[str, Any]:
         """What run.json says."""
         path = self.folder / "run.json"

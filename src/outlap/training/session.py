@@ -14,6 +14,7 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.files import remove_partials
+from outlap.provenance import provenance
 from outlap.track.catalog import load_tracks
 from outlap.training.callback import Progress, Stopwatch, TrainingCallback
 from outlap.training.checkpoints import check_finite, newest_model, reseed, save_checkpoint, save_progress
@@ -51,7 +52,7 @@ def train(
     model = None if resume else config.make_model(environment)
     run = resume or create_run(folder, config)
     if model is None:
-        run.begin_session()
+        run.write_record(resumed=[*run.record().get("resumed", []), provenance()])
         remove_partials(run.folder)
         model = newest_model(run, environment, config) or config.make_model(environment)
     run.write_record(tracks={track.name: track.fingerprint for track in environment.env.tasks.tracks})
