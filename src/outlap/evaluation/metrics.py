@@ -54,12 +54,12 @@ def summarise_methods(rows: pd.DataFrame) -> dict[str, Any]:
     rows = rows.assign(crash_rate=(rows["outcome"] == CRASH).astype(float))
 
     def of(chosen: pd.DataFrame) -> dict[str, Any]:
-        seeds = chosen.groupby("adaptation_seed")[list(METHOD_MEANS)].mean()  # of what is known
-        counts = {"episodes": len(chosen), "seeds": len(seeds)}
-        return {**counts, **{name: _mean(seeds[name].to_numpy(np.float64)) for name in METHOD_MEANS}}
+        seeds = chosen.groupby("adaptation_seed")
+        means = {name: np.asarray(seeds[name].mean(), np.float64) for name in METHOD_MEANS}  # NaN left out
+        return {"episodes": len(chosen), "seeds": len(seeds), **{name: _mean(mean) for name, mean in means.items()}}
 
     return {
-        method: {"all": of(mine), "tracks": {track: of(part) for track, part in mine.groupby("track", sort=False)}}
+        str(method): {"all": of(mine), "tracks": {track: of(part) for track, part in mine.groupby("track", sort=False)}}
         for method, mine in rows.groupby("method", sort=False)
     }
 

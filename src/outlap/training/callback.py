@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -92,4 +93,4 @@ class TrainingCallback(BaseCallback):
             return {}
         logged = [name for name in episodes if name in EPISODE_FIELDS or str(name).startswith(REWARD_PREFIX)]
         means = episodes[logged].mean().dropna()  # a lap time is known after a lap
-        return {**means.to_dict(), "crash_rate": float((episodes["outcome"] == CRASH).mean())}
+        return {**means.to_dict(), "crash_rate": float(np.mean(np.asarray(episodes["outcome"] == CRASH)))}

@@ -102,7 +102,8 @@ def reseed(model: Any, config: TrainingConfig) -> None:
 
 def begin_episodes(model: Any) -> None:
     """Begin an episode in every world, as `learn` does when it resumes a training."""
-    model._last_obs = model.env.reset()
+    environment = model.env
+    model._last_obs = environment.reset()
     model._last_episode_starts = np.ones(model.n_envs, bool)
     if isinstance(model, MQL):
-        collector.begin_episodes(model.replay_buffer, model.env, model._last_obs)
+        collector.begin_episodes(model.replay_buffer, environment, model._last_obs)
