@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from outlap.cli.benchmark import mql_with_replay
+from outlap.experiments.throughput import mql_with_replay
 
 SIZES = {"scan": 540, "pose": 3, "vel": 3, "heading": 2}
 ACTIONS, HISTORY, HIDDEN, BATCH, ROWS, UPDATES = 2, 10, 128, 256, 8192, 10

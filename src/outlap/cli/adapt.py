@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import shlex
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from pydantic.dataclasses import dataclass
 from tyro.conf import Positional, arg
 
-from outlap.cli.arguments import check_least
-from outlap.cli.output import CommandResult
-from outlap.cli.races import unused
-from outlap.cli.recordings import with_recordings
+from outlap.cli.command import Count, CountOrZero, Positive
+from outlap.cli.output import CommandResult, dated_folder, table
+from outlap.cli.races import with_recordings
 from outlap.cli.work import WorkCommand
 
 if TYPE_CHECKING:
@@ -41,16 +40,16 @@ class Adapt(WorkCommand):
     clip: tuple[Rule, ...] = ("none", "fixed", "abc")
     """How propensity weights are clipped: Adaptive Beta Clipping, the original's fixed clip, or not."""
 
-    seeds: int = 5
+    seeds: Count = 5
     """Adaptations to each track with each clip rule."""
 
-    iterations: int = 10
+    iterations: Count = 10
     """Of each adaptation."""
 
-    collect_steps: int = 100
+    collect_steps: Count = 100
     """Actions in the new task that each of --collect-worlds makes before every iteration."""
 
-    collect_worlds: int = 8
+    collect_worlds: Count = 8
     """Cars that collect."""
 
     on_task_steps: int = 5
@@ -62,16 +61,16 @@ class Adapt(WorkCommand):
     learning_rate: float = 1e-4
     """Of the adaptation."""
 
-    episodes: int = 100
+    episodes: Count = 100
     """Raced on each track before, and after each adaptation."""
 
-    time_limit: float = 40.0
+    time_limit: Positive = 40.0
     """[s] of an episode."""
 
     seed: int = 0
     """Of the episodes, and the first of the adaptations."""
 
-    record: int = 0
+    record: CountOrZero = 0
     """Of each track's episodes, keep so many, raced before and after the first adaptation with each clip rule, to be
     looked at with `outlap replay`, `outlap video` or `outlap plot`."""
 
@@ -86,9 +85,6 @@ class Adapt(WorkCommand):
         from outlap.training.subject import held_out_tracks
 
         self.check_flags()
-        for name in ("seeds", "iterations", "collect_steps", "collect_worlds", "episodes"):
-            check_least(f"--{name.replace('_', '-')}", getattr(self, name), 1)
-        check_least("--record", self.record, 0)
         run = load_run(self.run_folder)
         names = self.tracks or held_out_tracks(run)
         tracks = load_tracks(names)
@@ -97,7 +93,7 @@ class Adapt(WorkCommand):
         seeds = range(self.seed, self.seed + self.seeds)
         settings = {name: getattr(self, name) for name in constants}
         units = adaptation_units(run, names, self.clip, seeds, settings, self.collect_worlds, races)
-        folder = self.out or unused(run.folder / "adaptations" / time.strftime("%Y%m%d-%H%M%S"))
+        folder = self.out or dated_folder(run.folder / "adaptations")
         prepare_adaptations(folder)
         self.do_units(units, folder / "work", "adapting", resume=f"go on with: {self._command(folder)}")
         fingerprints = {track.name: track.fingerprint for track in tracks}
@@ -117,23 +113,25 @@ class Adapt(WorkCommand):
 
 
 def _print(console: Console, data: Mapping[str, Any]) -> None:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, title="before and after adapting")
-    for heading in ("method", "track", "crash rate [%]", "speed [m/s]", "lap / least", "progress [m]"):
-        table.add_column(heading, justify="left" if heading in ("method", "track") else "right")
+    rows: list[tuple[str, ...] | None] = []
     for method, summary in data.items():
-        if method == "folder":
-            continue
-        for track, each in [*summary["tracks"].items(), ("all", summary["all"])]:
-            crashes = _cell(each["crash_rate"], 100.0, 1)
-            speed, progress = _cell(each["mean_speed_mps"], 1.0, 2), _cell(each["progress_m"], 1.0, 0)
-            ratio = _cell(each["lap_time_ratio"], 1.0, 3)
-            table.add_row(method, track, crashes, speed, ratio, progress, end_section=track == "all")
-    console.print(table)
+        if method != "folder":
+            for track, each in [*summary["tracks"].items(), ("all", summary["all"])]:
+                cells = (_cell(each[key], scale, digits) for key, scale, digits in COLUMNS.values())
+                rows.append((method, track, *cells))
+            rows.append(None)
+    left = ("method", "track")
+    console.print(table((*left, *COLUMNS), rows, left, "before and after adapting"))
     console.print("mean over adaptation seeds [95 % interval]", style="dim")
     console.print(f"results: {data['folder']}")
+
+
+COLUMNS = {  # heading: key, scale, digits
+    "crash rate [%]": ("crash_rate", 100.0, 1),
+    "speed [m/s]": ("mean_speed_mps", 1.0, 2),
+    "lap / least": ("lap_time_ratio", 1.0, 3),
+    "progress [m]": ("progress_m", 1.0, 0),
+}
 
 
 def _cell(value: Mapping[str, float], scale: float, digits: int) -> str:

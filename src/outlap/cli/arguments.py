@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import inspect
 import io
 import os
 import re
@@ -38,7 +39,7 @@ def parse(command: type[CommandT], arguments: Sequence[str], prog: str) -> Comma
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint), _no_line_breaks(arguments):
-            return tyro.cli(command, args=list(arguments), prog=prog, **default)
+            return tyro.cli(_own_flags_first(command), args=list(arguments), prog=prog, **default)
     except (SystemExit, ValidationError) as stop:  # tyro lets pass what a Config of all flags refuses
         if isinstance(stop, SystemExit) and not stop.code:
             raise
@@ -47,10 +48,14 @@ def parse(command: type[CommandT], arguments: Sequence[str], prog: str) -> Comma
     raise OutlapError(message)
 
 
-def check_least(flag: str, value: int, least: int) -> None:
-    """Raises OutlapError for a flag whose value is too small."""
-    if value < least:
-        raise OutlapError(f"{flag} is {value}; must be {least} or more")
+def _own_flags_first(command: type[CommandT]) -> type[CommandT]:
+    """Let the help list the flags of a command before those of its base classes."""
+    owners = [inspect.get_annotations(each) for each in command.__mro__]
+    fields: dict[str, Any] = vars(command)["__dataclass_fields__"]
+    ordered = sorted(fields.items(), key=lambda item: [item[0] in owner for owner in owners].index(True))
+    fields.clear()
+    fields.update(ordered)
+    return command
 
 
 def _config_file(arguments: Sequence[str]) -> str | None:
@@ -90,7 +95,7 @@ def _value_problem(stop: BaseException, arguments: Sequence[str]) -> str | None:
             line = explain(error, prefix=f"{where}." if where else "")
             field, rest = re.fullmatch(r"(\S*)(.*)", line, re.DOTALL).groups()  # type: ignore[union-attr]
             # The field's path starts with attributes of the command that its flags leave out.
-            parts = field.split(".")
+            parts = [part for part in field.split(".") if not part.isdigit()]  # no places in a tuple
             tails = (".".join(parts[start:]) for start in range(len(parts)))
             flags = (f"--{tail.replace('_', '-')}" for tail in tails)
             return next((flag for flag in flags if flag in given), field) + rest

@@ -1,17 +1,46 @@
-"""Base classes of the commands: the flags that every command has."""
+"""Base classes of the commands, and the types of their flags.
+
+Commands are pydantic dataclasses: a value outside the limits of its type is one line that names the flag.
+"""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from typing import Annotated
 
+from pydantic import AfterValidator, Field
+from pydantic.dataclasses import dataclass
 from tyro.conf import FlagCreatePairsOff
 
 from outlap.cli.output import CommandResult
 from outlap.cli.progress import Update, progress_bar
 
+
+def at_least(least: int) -> AfterValidator:
+    """Return the limit of an integer flag."""
+
+    def check(value: int) -> int:
+        if value < least:
+            raise ValueError(f"must be {least} or more")
+        return value
+
+    return AfterValidator(check)
+
+
+def _positive(value: float) -> float:
+    if not 0.0 < value < math.inf:
+        raise ValueError("must be > 0")
+    return value
+
+
 Flag = FlagCreatePairsOff[bool]  # --name, without a --no-name
+Count = Annotated[int, at_least(1)]
+CountOrZero = Annotated[int, at_least(0)]
+Positive = Annotated[float, AfterValidator(_positive)]  # and finite
+Share = Annotated[float, Field(gt=0.0, le=1.0)]
+Pixels = Annotated[int, at_least(64)]
 
 
 @dataclass(frozen=True, kw_only=True)

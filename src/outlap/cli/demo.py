@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from outlap.cli.command import LongCommand
-from outlap.cli.output import CommandResult
+from pydantic.dataclasses import dataclass
+
+from outlap.cli.command import Count, CountOrZero, LongCommand
+from outlap.cli.output import CommandResult, dated_folder
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @dataclass(frozen=True)
@@ -21,10 +25,10 @@ class Demo(LongCommand):
     steps: int = 350_000
     """Actions to train for, all worlds together."""
 
-    episodes: int = 30
+    episodes: Count = 30
     """To race on each held-out circuit before the adaptation to it, and after."""
 
-    seed: int = 0
+    seed: CountOrZero = 0
     """Of the training, the adaptation and the episodes."""
 
     out: Path | None = None
@@ -43,18 +47,18 @@ class Demo(LongCommand):
         growth = 4.0 * usual.env.reward.collision_steps * self.steps / usual.total_steps
         reward = usual.env.reward.model_copy(update={"collision_steps": growth})
         env = usual.env.model_copy(update={"reward": reward})
-        settings = {
-            "total_steps": self.steps, "seed": self.seed, "held_out_tracks": BUILTIN_HELD_OUT, "env": env,
-        }  # fmt: skip
+        settings = {"total_steps": self.steps, "seed": self.seed, "held_out_tracks": BUILTIN_HELD_OUT, "env": env}
         config = validate(MQLConfig, settings, "outlap demo")
-        folder = self.out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
+        folder = self.out or dated_folder(Path("runs"), "demo-")
         trained = TrainMQL(settings=config, out=folder, quiet=self.quiet).run()
         adapted = Adapt(
             folder, clip=("abc",), seeds=1, episodes=self.episodes, seed=self.seed, record=1, quiet=self.quiet
         ).run()
 
-        def show(console) -> None:
+        data = {"training": trained.data, "adaptation": adapted.data}
+
+        def show(console: Console) -> None:
             trained.show(console)
             adapted.show(console)
 
-        return CommandResult({"training": trained.data, "adaptation": adapted.data}, show)
+        return CommandResult(data, show)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from pydantic.dataclasses import dataclass
 from tyro.conf import Positional, arg
 
-from outlap.cli.arguments import check_least
-from outlap.cli.command import Flag, LongCommand
-from outlap.cli.interrupts import NOTHING_KEPT
-from outlap.cli.output import CommandResult
-from outlap.cli.races import RaceFlags, Subject, check_positive, unused
-from outlap.cli.recordings import with_recordings
+from outlap.cli.command import Count, CountOrZero, Flag, LongCommand, Positive
+from outlap.cli.output import NOTHING_KEPT, CommandResult, dated_folder, table
+from outlap.cli.races import RaceFlags, with_recordings
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
@@ -27,6 +25,7 @@ if TYPE_CHECKING:
     from outlap.envs.race_config import RaceConfig
     from outlap.evaluation.rollout import EvaluationProgress
     from outlap.track import Track
+    from outlap.training.subject import Subject
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,29 +42,30 @@ class Evaluate(RaceFlags, LongCommand):
     tracks: tuple[str, ...] = ()
     """Names or map folders; by default the run's held-out tracks, or else the built-in held-out ones."""
 
-    episodes: int = 100
+    episodes: Count = 100
     """On each track."""
 
-    laps: int = 3
+    laps: CountOrZero = 3
     """Completed laps that end an episode, counted from line to line; 0: none do."""
 
-    time_limit: float | None = None
+    time_limit: Positive | None = None
     """[s] of an episode; by default enough for one lap more than --laps at 1 m/s."""
 
-    worlds: int = 128
+    worlds: Count = 128
     """Episodes raced at once; changes the speed, and not the results."""
 
     stochastic: Flag = False
     """Draw actions from the policy's distribution, as in training; then results depend on --worlds too."""
 
-    record: int = 0
+    record: CountOrZero = 0
     """Of each track's episodes, keep so many to be looked at with `outlap replay`, `outlap video` or `outlap plot`."""
 
     out: Path | None = None
     """A new or empty folder for the results; by default RUN/evaluations/TIME."""
 
     def run(self) -> CommandResult:
-        self._check_flags()
+        if self.laps == 0 and self.time_limit is None:
+            raise OutlapError("--laps is 0; must be 1 or more, or be given with a --time-limit")
         from outlap.evaluation.protocol import standing_starts
         from outlap.track.catalog import load_tracks
         from outlap.training.run import is_run
@@ -79,7 +79,7 @@ class Evaluate(RaceFlags, LongCommand):
         tracks = load_tracks(self.tracks or held_out_tracks(found.task))
         env = standing_starts(found.env, tracks, self.laps, self.time_limit)
         home = found.run.folder if found.run else Path("runs") / found.driver.name
-        folder = self.out or unused(home / "evaluations" / time.strftime("%Y%m%d-%H%M%S"))
+        folder = self.out or dated_folder(home / "evaluations")
         data = self._evaluate(found, env, tracks, folder)
         result = CommandResult(data, lambda console: show_summary(console, data))
         if not self.record:
@@ -99,17 +99,10 @@ class Evaluate(RaceFlags, LongCommand):
 
             try:
                 return evaluate_into(
-                    folder,
-                    found.driver,
-                    env,
-                    tracks,
-                    episodes=self.episodes,
-                    seed=self.seed,
-                    num_worlds=self.worlds,
+                    folder, found.driver, env, tracks, episodes=self.episodes, seed=self.seed, num_worlds=self.worlds,
                     trained_on=run.trained_on([track.name for track in tracks]) if run else (),
-                    facts={**(run.policy_record() if run else {}), "stochastic": self.stochastic},
-                    on_progress=show,
-                )
+                    facts={**(run.policy_record() if run else {}), "stochastic": self.stochastic}, on_progress=show,
+                )  # fmt: skip
             except KeyboardInterrupt:
                 print(f"\n{NOTHING_KEPT}", file=sys.stderr)
                 raise
@@ -120,50 +113,29 @@ class Evaluate(RaceFlags, LongCommand):
 
         number = min(self.record, self.episodes)
         with self.progress("recording", number * len(tracks), "episodes") as update:
-            done: list[Path] = []
-
-            def recorded(path: Path) -> None:
-                done.append(path)
-                update(len(done), path.name)
-
+            done = itertools.count(1)
             for track in tracks:
-                record_episodes(driver, env, track, self.seed, number, folder / RECORDINGS, on_recorded=recorded)
-
-    def _check_flags(self) -> None:
-        self.check_races()
-        for flag, value, least in (
-            ("--episodes", self.episodes, 1),
-            ("--laps", self.laps, 0),
-            ("--worlds", self.worlds, 1),
-            ("--record", self.record, 0),
-        ):
-            check_least(flag, value, least)
-        check_positive("--time-limit", self.time_limit)
-        if self.laps == 0 and self.time_limit is None:
-            raise OutlapError("--laps is 0; must be 1 or more, or be given with a --time-limit")
+                record_episodes(
+                    driver, env, track, self.seed, number, folder / RECORDINGS,
+                    on_recorded=lambda path: update(next(done), path.name),
+                )  # fmt: skip
 
 
 def show_summary(console: Console, data: Mapping[str, Any]) -> None:
     """Print what an evaluation found, and where it is."""
     trained_on = data["trained_on"]
     each = next(iter(data["tracks"].values()))["episodes"]
-    console.print(
-        f"{data['driver']}: {each} episodes on each track, {data['all']['episodes']} in all",
-    )  # fmt: skip
+    console.print(f"{data['driver']}: {each} episodes on each track, {data['all']['episodes']} in all")
     for columns in (DRIVING, RACING, EPISODES):
         console.print()
         console.print(_table(data, columns))
     console.print()
-    console.print(
-        "mean ± sd over episodes, [95 % interval of the mean]",
-        style="dim",
-    )  # fmt: skip
+    console.print("mean ± sd over episodes, [95 % interval of the mean]", style="dim")
     if (error := data["all"]["min_lap_error"]) is not None:
         exact = f", too long by up to {100.0 * error:.2f} % for two cars drawn at random" if error else ""
         console.print(
-            f"lap / least: lap time over the minimum-time lap of the same track and vehicle{exact}",
-            style="dim",
-        )  # fmt: skip
+            f"lap / least: lap time over the minimum-time lap of the same track and vehicle{exact}", style="dim"
+        )
     if trained_on:
         console.print(f"* trained on {', '.join(trained_on)}: not a result on unseen tracks")
     console.print(f"results: {data['folder']}")
@@ -172,38 +144,19 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
 DRIVING = ("crash_rate", "completed_laps", "lap_time_s", "lap_time_ratio", "mean_speed_mps")
 RACING = ("crashes", "overtakes", "places_lost")
 EPISODES = ("progress_m", "episode_steps", "episode_return")
-DIGITS = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "lap_time_ratio": 3, "episode_return": 1}
 HEADINGS = {
-    "crash_rate": "crash rate",
-    "completed_laps": "laps",
-    "lap_time_s": "lap time [s]",
-    "lap_time_ratio": "lap / least",
-    "mean_speed_mps": "speed [m/s]",
-    "progress_m": "progress [m]",
-    "crashes": "crashes",
-    "overtakes": "overtakes",
-    "places_lost": "places lost",
-    "episode_steps": "steps",
-    "episode_return": "return",
-}
+    "crash_rate": "crash rate", "completed_laps": "laps", "lap_time_s": "lap time [s]", "lap_time_ratio": "lap / least",
+    "mean_speed_mps": "speed [m/s]", "progress_m": "progress [m]", "crashes": "crashes", "overtakes": "overtakes",
+    "places_lost": "places lost", "episode_steps": "steps", "episode_return": "return",
+}  # fmt: skip
+DIGITS = {"progress_m": 0, "episode_steps": 0, "lap_time_s": 1, "lap_time_ratio": 3, "episode_return": 1}
 
 
 def _table(data: Mapping[str, Any], columns: Sequence[str]) -> Table:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
-    table.add_column("track", overflow="fold")
-    for column in columns:
-        table.add_column(Text(HEADINGS[column]), justify="right", no_wrap=True)
-    for name, summary in data["tracks"].items():
-        mark = "*" if name in data["trained_on"] else ""
-        table.add_row(Text(name + mark), *(_cell(summary, column) for column in columns))
-    if len(data["tracks"]) > 1:
-        table.add_section()
-        table.add_row("all", *(_cell(data["all"], column) for column in columns))
-    return table
+    summaries = {f"{name}{'*' * (name in data['trained_on'])}": each for name, each in data["tracks"].items()}
+    rows = [(name, *(_cell(summary, column) for column in columns)) for name, summary in summaries.items()]
+    of_all = [None, ("all", *(_cell(data["all"], column) for column in columns))] if len(rows) > 1 else []
+    return table(("track", *(HEADINGS[column] for column in columns)), [*rows, *of_all], left=("track",))
 
 
 def _cell(summary: Mapping[str, Any], column: str) -> str:

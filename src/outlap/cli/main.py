@@ -17,7 +17,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from outlap.cli.interrupts import INTERRUPTED
 from outlap.cli.output import (
     STANDARD_OUTPUT,
     check_json_path,
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
 # A full disk, a quota, a file system or a folder that cannot be written: no bugs.
 STORAGE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.ENOTDIR)
-DONE, BAD_INPUT, OUTPUT_CLOSED = 0, 2, 141
+DONE, BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED = 0, 2, 130, 141
 
 
 class Entry(NamedTuple):
@@ -60,9 +59,9 @@ COMMANDS = (
     Entry("adapt", "outlap.cli.adapt:Adapt", "adapt a meta-trained policy to tracks, and race it before and after"),
     Entry("evaluate", "outlap.cli.evaluate:Evaluate", "race a trained policy on tracks and measure it"),
     Entry("export", "outlap.cli.export:Export", "write a policy as one ONNX file for a car"),
-    Entry("watch", "outlap.cli.watch:WatchRaces", "watch races in a window, and drive in them"),
-    Entry("replay", "outlap.cli.replay:Replay", "write races as one HTML file that plays in a browser"),
-    Entry("video", "outlap.cli.video:Video", "write races as a video or an animated picture"),
+    Entry("watch", "outlap.cli.viewers:WatchRaces", "watch races in a window, and drive in them"),
+    Entry("replay", "outlap.cli.viewers:Replay", "write races as one HTML file that plays in a browser"),
+    Entry("video", "outlap.cli.viewers:Video", "write races as a video or an animated picture"),
     Entry("plot trajectories", "outlap.cli.plot:PlotTrajectories", "draw where cars drove, coloured by speed"),
     Entry("plot friction", "outlap.cli.plot:PlotFriction", "draw how much of the tyres' grip was used"),
     Entry("plot lap-times", "outlap.cli.plot:PlotLapTimes", "draw lap times over the least possible, by track"),
@@ -70,7 +69,7 @@ COMMANDS = (
     Entry("plot contexts", "outlap.cli.plot:PlotContexts", "draw how a policy's context tells tasks apart"),
     Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),
     Entry("benchmark mql", "outlap.cli.benchmark:BenchmarkMQL", "measure updates of Meta-Q-Learning"),
-    Entry("benchmark car", "outlap.cli.benchmark_car:BenchmarkCar", "measure an exported policy's latency"),
+    Entry("benchmark car", "outlap.cli.benchmark:BenchmarkCar", "measure an exported policy's latency"),
     Entry("demo", "outlap.cli.demo:Demo", "meta-train, adapt and race on built-in circuits in a few minutes"),
 )
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from pydantic.dataclasses import dataclass
 from tyro.conf import Positional, arg
 
-from outlap.cli.arguments import check_least
-from outlap.cli.command import Command, LongCommand
-from outlap.cli.output import CommandResult
+from outlap.cli.command import Command, Count, LongCommand, Positive
+from outlap.cli.output import CommandResult, lines, table
 from outlap.cli.work import WorkCommand
 from outlap.drivers.population import read_manifest
 from outlap.errors import OutlapError
@@ -46,25 +45,28 @@ class TrainOpponents(WorkCommand):
 
     settings: Annotated[PPOConfig, arg(name="")] = field(default_factory=opponent_defaults)
 
-    laps: int = 5
+    laps: Count = 5
     """Consecutive laps that an opponent must complete from every start."""
 
-    starts: int = 20
+    starts: Count = 20
     """Of its verification."""
 
     def run(self) -> CommandResult:
-        from outlap.experiments.opponent_units import OpponentUnit, enter_all, name_opponents, verification_row
+        from outlap.experiments.opponent_units import (
+            OpponentUnit,
+            enter_all,
+            name_opponents,
+            parse_speeds,
+            verification_row,
+        )
         from outlap.track import load_track
 
-        check_least("--laps", self.laps, 1)
-        check_least("--starts", self.starts, 1)
         self.check_flags()
         track = load_track(self.track)
         folder = self.out or Path("populations") / track.name
-        opponents = name_opponents(track.name, _span(self.speeds), self.held_out)
         units = [
             OpponentUnit(each.name, self.settings, self.track, each.max_speed_mps, each.split, self.laps, self.starts)
-            for each in opponents
+            for each in name_opponents(track.name, parse_speeds(self.speeds), self.held_out)
         ]
         self.do_units(units, folder / "work", "training")
         command = shlex.join(["outlap", *sys.argv[1:]])
@@ -87,7 +89,7 @@ class RecordLap(Command):
     out: Path
     """The csv file to write: t_s, x_m, y_m, yaw_rad, vx_mps."""
 
-    v_max: float | None = None
+    v_max: Positive | None = None
     """[m/s] top speed of the car, in place of the driver's own."""
 
     seed: int = 0
@@ -102,8 +104,6 @@ class RecordLap(Command):
 
         if self.out.suffix != ".csv":
             raise OutlapError(f"--out is {self.out}; must end in .csv, by which a recorded lap is known")
-        if self.v_max is not None and not 0.0 < self.v_max < math.inf:
-            raise OutlapError(f"--v-max is {self.v_max}; must be > 0")
         driver, env, _ = find_subject(self.driver)
         env = with_top_speed(env, self.v_max)
         lap = record_lap(driver, env, load_track(self.track), self.seed)
@@ -112,10 +112,7 @@ class RecordLap(Command):
         except OSError as error:
             raise OutlapError(f"--out {self.out}: cannot be written: {error.strerror}") from None
         data = {"lap": path, "lap_time_s": float(lap[-1, 0]), "points": len(lap)}
-        return CommandResult(
-            data,
-            lambda console: console.print(f"{lap[-1, 0]:.2f} s, {len(lap)} points: {path}"),
-        )
+        return CommandResult(data, lines(f"{lap[-1, 0]:.2f} s, {len(lap)} points: {path}"))
 
 
 @dataclass(frozen=True)
@@ -134,18 +131,6 @@ class ListOpponents(Command):
         return CommandResult({"opponents": rows}, lambda console: _print(console, rows, folder))
 
 
-def _span(text: str) -> list[float]:
-    """first:last:step as the numbers that it means."""
-    try:
-        first, last, step = (float(word) for word in text.split(":"))
-        count = math.floor((last - first) / step + 1e-6)
-        if step <= 0.0 or count < 0:
-            raise ValueError
-    except (ValueError, ArithmeticError):
-        raise OutlapError(f"--speeds is {text!r}; must be first:last:step, such as 2.0:6.0:0.5") from None
-    return [round(first + i * step, 6) for i in range(count + 1)]
-
-
 @dataclass(frozen=True)
 class VerifyOpponents(LongCommand):
     """Race every opponent of a population alone again, and take those that fail out of its manifest."""
@@ -153,17 +138,15 @@ class VerifyOpponents(LongCommand):
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """The population."""
 
-    laps: int = 5
+    laps: Count = 5
     """Consecutive laps that an opponent must complete from every start."""
 
-    starts: int = 20
+    starts: Count = 20
     """Standing starts anywhere on the lap."""
 
     def run(self) -> CommandResult:
         from outlap.experiments.opponent_units import verify_population
 
-        check_least("--laps", self.laps, 1)
-        check_least("--starts", self.starts, 1)
         with self.progress("verifying", len(read_manifest(self.folder)), "opponents") as update:
             rows = verify_population(self.folder, self.laps, self.starts, update)
         data = {"folder": self.folder, "opponents": rows}
@@ -171,19 +154,14 @@ class VerifyOpponents(LongCommand):
 
 
 def _print(console: Console, rows: Sequence[dict[str, Any]], folder: Path) -> None:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("opponent", "top speed [m/s]", "half", "laps", "crash rate", "lap time [s]", ""):
-        left = heading in ("opponent", "half", "")
-        table.add_column(heading, justify="left" if left else "right", no_wrap=heading == "opponent")
-    for row in rows:
-        lap_time = "-" if row["lap_time_s"] is None else f"{row['lap_time_s']:.1f}"
-        failed = "" if row.get("verified", True) else "failed: left out"
-        table.add_row(
-            row["name"], f"{row['max_speed_mps']:.1f}", row["split"].replace("_", " "), str(row["verified_laps"]),
-            f"{row['crash_rate']:.0%}", lap_time, failed,
-        )  # fmt: skip
-    console.print(table)
+    cells = [
+        (
+            row["name"], f"{row['max_speed_mps']:.1f}", row["split"].replace("_", " "), row["verified_laps"],
+            f"{row['crash_rate']:.0%}", "-" if row["lap_time_s"] is None else f"{row['lap_time_s']:.1f}",
+            "" if row.get("verified", True) else "failed: left out",
+        )
+        for row in rows
+    ]  # fmt: skip
+    headings = ("opponent", "top speed [m/s]", "half", "laps", "crash rate", "lap time [s]", "")
+    console.print(table(headings, cells, left=("opponent", "half", "")))
     console.print(f"population: {folder}")

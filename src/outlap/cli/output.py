@@ -6,7 +6,8 @@ import contextlib
 import dataclasses
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,10 @@ from outlap.files import atomic_write, to_json
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 STANDARD_OUTPUT = "-"
+NOTHING_KEPT = "nothing is kept; begin again with the same command"  # after Ctrl-C
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,13 +45,7 @@ def check_json_path(path: str | None) -> None:
         return
     if not path or Path(path).is_dir():
         raise OutlapError(f"--json is {path!r}, a folder; must be a file, or - for standard output")
-    folder = Path(path).absolute().parent
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutlapError(f"--json {path}: cannot make the folder {folder}: {error.strerror}") from None
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutlapError(f"--json {path}: the folder {folder} cannot be written to")
+    _make_parent("--json", Path(path))
 
 
 def check_output_path(path: Path, endings: Sequence[str]) -> None:
@@ -58,12 +55,62 @@ def check_output_path(path: Path, endings: Sequence[str]) -> None:
     """
     if path.suffix.lower() not in endings:
         raise OutlapError(f"--out is {path}; must end in {' or '.join(endings)}")
+    _make_parent("--out", path)
+    if path.is_dir():
+        raise OutlapError(f"--out {path}: is a folder; give another file")
+
+
+def _make_parent(flag: str, path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutlapError(f"--out {path}: cannot make the folder {path.parent}: {error.strerror}") from None
-    if path.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
-        raise OutlapError(f"--out {path}: cannot be written; give another file")
+        raise OutlapError(f"{flag} {path}: cannot make the folder {path.parent}: {error.strerror}") from None
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise OutlapError(f"{flag} {path}: the folder {path.parent} cannot be written to; give another file")
+
+
+def dated_folder(home: Path, name: str = "") -> Path:
+    """Return a folder in `home` that does not exist, named after the present time; the default of `--out`."""
+    folder = home / time.strftime(f"{name}%Y%m%d-%H%M%S")
+    numbered = (folder.with_name(f"{folder.name}-{number}") for number in range(2, 1000))
+    return next(path for path in (folder, *numbered) if not path.exists())
+
+
+def lines(*texts: str) -> Callable[[Console], None]:
+    """Return a function that prints lines, for `CommandResult.show`."""
+
+    def show(console: Console) -> None:
+        for text in texts:
+            console.print(text)
+
+    return show
+
+
+def table(
+    headings: Sequence[str], rows: Iterable[Sequence[object] | None], left: Sequence[str] = (), title: str | None = None
+) -> Table:
+    """Return a table to print.
+
+    Args:
+        headings: of the columns.
+        rows: a value for each column, shown as `str`; None draws a line.
+        left: headings of columns that are aligned to the left, which are text; the others are numbers.
+        title: above the table.
+    """
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    made = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", show_edge=False, pad_edge=False)
+    for heading in headings:
+        text = heading in left
+        made.add_column(Text(heading), justify="left" if text else "right", overflow="fold", no_wrap=not text)
+    for row in rows:
+        if row is None:
+            made.add_section()
+        else:
+            made.add_row(*(value if isinstance(value, Text) else Text(str(value)) for value in row))
+    return made
 
 
 def deliver(result: CommandResult, json_path: str | None) -> None:

@@ -1,19 +1,30 @@
-"""What a command races: drivers found by name, in the task that its flags ask for."""
+"""Flags of commands that race a driver or show episodes, and what they print about recordings."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from outlap.cli.arguments import check_least
-from outlap.cli.command import Flag
+from pydantic.dataclasses import dataclass
+from tyro.conf import Positional, arg
+
+from outlap.cli.command import Count, CountOrZero, Flag, Positive
+from outlap.cli.output import CommandResult, lines
+from outlap.cli.progress import progress_bar
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
-    from outlap.drivers.driver import Driver
-    from outlap.envs.race_config import RaceConfig
-    from outlap.training.run import Run
+    from rich.console import Console
+
+    from outlap.evaluation.recording import Recording
+    from outlap.track import Track
+    from outlap.training.subject import Subject
+
+Episodes = Annotated[Positional[tuple[str, ...]], arg(metavar="EPISODE")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,10 +35,10 @@ class RaceFlags:
     """A run folder: race as in its training, its cars with their ranges, on its held-out tracks; of a driver that has a
     scanner and a top speed of its own, those stay. By default the driver's own task."""
 
-    v_max: float | None = None
+    v_max: Positive | None = None
     """[m/s] top speed of the cars, in place of the run's; what the policy commands stays within what it learnt."""
 
-    num_cars: int | None = None
+    num_cars: Count | None = None
     """The driver's car and opponents; by default as many as the run was trained with."""
 
     opponents: tuple[str, ...] = ()
@@ -45,61 +56,78 @@ class RaceFlags:
     formation: Literal["queue", "behind", "grid", "scattered"] | None = None
     """In which the cars start, in place of the run's; behind: the driver's car is the last."""
 
-    seed: int = 0
+    seed: CountOrZero = 0
     """Of the episodes."""
 
-    def check_races(self) -> None:
-        """Raises OutlapError for a flag that is out of its range."""
-        check_least("--seed", self.seed, 0)
-        check_least("--num-cars", 1 if self.num_cars is None else self.num_cars, 1)
-        check_positive("--v-max", self.v_max)
-
     def subject(self, name: str, *, deterministic: bool = True) -> Subject:
-        """A driver, and what it is to race in. Raises what `find_subject` does."""
-        from outlap.evaluation.protocol import made_for, with_top_speed
-        from outlap.training.run import load_run
-        from outlap.training.subject import find_subject
+        """Return a driver, and what it is to race in. Raises what `find_subject` does."""
+        from outlap.training.subject import subject_in_race
 
-        driver, env, run = find_subject(name, deterministic=deterministic, seed=self.seed)
-        task = run
-        if self.task is not None:
-            task = load_run(self.task)
-            env = made_for(driver, task.config.env)
-        env = self._as_asked(with_top_speed(env, self.v_max))
-        if self.racing_line and env.num_cars == 1 and "line_ahead" not in driver.observation_terms:
-            raise OutlapError(f"--racing-line is {self.racing_line}; {driver.name} follows no line")
-        return Subject(driver, env, run, task)
-
-    def _as_asked(self, env: RaceConfig) -> RaceConfig:
-        changes: dict[str, Any] = {"opponent_split": self.opponent_split, "opponent_code": self.opponent_code}
-        if self.num_cars is not None:
-            changes["num_cars"] = self.num_cars
-        if self.opponents:
-            changes |= {"num_cars": max(2, env.num_cars), **changes, "opponents": self.opponents}
-        if self.racing_line is not None:
-            changes["racing_line"] = self.racing_line
-        if self.formation:
-            changes["start"] = env.start.model_copy(update={"formation": self.formation})
-        return env.model_copy(update=changes)
+        flags = {field.name: getattr(self, field.name) for field in fields(RaceFlags)}
+        return subject_in_race(name, deterministic=deterministic, **flags)
 
 
-@dataclass(frozen=True)
-class Subject:
-    """A driver, and what it races in."""
+@dataclass(frozen=True, kw_only=True)
+class EpisodeFlags(RaceFlags):
+    """Flags of commands that show episodes: of drivers, raced now, or recorded before."""
 
-    driver: Driver
-    env: RaceConfig
-    run: Run | None  # the driver's, if it was trained
-    task: Run | None  # that the environment is of
+    track: str | None = None
+    """Name or map folder; by default that of the recordings, or the first held-out one of the run."""
+
+    time_limit: Positive = 60.0
+    """[s] of an episode that is raced now."""
+
+    laps: CountOrZero = 0
+    """Completed laps that end it; 0: none do."""
+
+    def episodes(self, names: Sequence[str], quiet: bool) -> tuple[list[Recording], Track]:
+        """Return the recordings of what is named, on one track. Raises what `find_episodes` does."""
+        from outlap.evaluation.protocol import standing_starts
+        from outlap.evaluation.recorder import record_episode
+        from outlap.viewer.episodes import find_episodes, recording_files
+
+        if not names:
+            raise OutlapError(
+                "no episode named; name recordings (.npz), folders of them, or drivers such as pure-pursuit"
+            )
+        given = [field.name for field in fields(RaceFlags) if getattr(self, field.name) != field.default]
+        if given and all(recording_files(name) for name in names):
+            flag = given[0].replace("_", "-")
+            raise OutlapError(f"--{flag}: is for drivers that race now; what is named is recorded already")
+
+        def race(subject: Subject, track: Track, seed: int) -> Recording:
+            env = standing_starts(subject.env, [track], self.laps, self.time_limit)
+            title = f"racing {subject.driver.name}"
+            with progress_bar(title, math.ceil(self.time_limit), "seconds", quiet) as update:
+                return record_episode(subject.driver, env, track, seed, on_progress=lambda now: update(int(now), ""))
+
+        return find_episodes(names, self.track, self.seed, self.subject, race)
 
 
-def check_positive(flag: str, value: float | None) -> None:
-    """Raises OutlapError for a number that is given, and not above 0 and finite."""
-    if value is not None and not 0.0 < value < float("inf"):
-        raise OutlapError(f"{flag} is {value}; must be > 0")
+def with_recordings(result: CommandResult, folder: Path, track: Track) -> CommandResult:
+    """Add to a command's result where its recordings are, and how to look at a track's first episode."""
+    from outlap.evaluation.recording import RECORDINGS
+
+    place = folder / RECORDINGS
+    first = f"{shlex.quote(f'{place / track.name}-000')}*"
+
+    def show(console: Console) -> None:
+        result.show(console)
+        console.print(f"look at it: outlap replay {first}")
+
+    return CommandResult({**result.data, "recordings": place}, show)
 
 
-def unused(folder: Path) -> Path:
-    """This folder, or one numbered like it where two evaluations begin in the same second."""
-    numbered = (folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))
-    return next(path for path in (folder, *numbered) if not path.exists())
+def shown(recordings: list[Recording], path: Path, seconds: float | None = None) -> CommandResult:
+    """Return the result of a command that has drawn recordings into a file."""
+    races = [
+        {"title": each.info.title, "outcome": each.info.outcome, "seconds": round(each.seconds, 2)}
+        for each in recordings
+    ]
+    data = {"file": path, "bytes": path.stat().st_size, "races": races}
+    if seconds is not None:
+        data["seconds_to_draw"] = round(seconds, 1)
+
+    took = "" if seconds is None else f", drawn in {seconds:.1f} s"
+    ended = (f"{race['title']}: {race['outcome']} after {race['seconds']} s" for race in races)
+    return CommandResult(data, lines(*ended, f"{path} ({path.stat().st_size / 1e6:.2f} MB{took})"))

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from pydantic.dataclasses import dataclass
 from tyro.conf import Positional, arg
 
-from outlap.cli.arguments import check_least
-from outlap.cli.command import Flag
-from outlap.cli.output import CommandResult
+from outlap.cli.command import Count, Flag
+from outlap.cli.output import CommandResult, lines, table
 from outlap.cli.work import WorkCommand, duration
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.text import Text
 
     from outlap.experiments.unit import Unit
 
@@ -42,7 +40,7 @@ class Reproduce(WorkCommand):
     methods: tuple[str, ...] = ()
     """Names or .yaml files; by default all that come with outlap."""
 
-    seeds: int | None = None
+    seeds: Count | None = None
     """Trainings of every method, in place of the budget's."""
 
     out: Path | None = None
@@ -59,7 +57,6 @@ class Reproduce(WorkCommand):
         from outlap.experiments.report import write_report
 
         self.check_flags()
-        check_least("--seeds", 1 if self.seeds is None else self.seeds, 1)
         plan = make_plan(self.wanted, self.budget, self.methods, self.seeds, self.driver_code)
         folder = self.out or Path("runs") / f"reproduce-{plan.budget_name}"
         work = folder / "work"
@@ -70,47 +67,29 @@ class Reproduce(WorkCommand):
         return CommandResult({**data, "folder": folder}, lambda console: _print(console, data, folder))
 
 
-def _cell(entry: Mapping[str, Any]) -> Text:
-    from rich.text import Text
-
+def _cell(entry: Mapping[str, Any]) -> str:
     text = f"{entry['value']:.0f}"
     if entry["low"] == entry["low"]:  # one seed has no interval
         text += f" [{entry['low']:.0f}, {entry['high']:.0f}]"
-    return Text(text + (f" ({entry['published']:g})" if isinstance(entry["published"], (int, float)) else ""))
+    return text + (f" ({entry['published']:g})" if isinstance(entry["published"], (int, float)) else "")
 
 
 def _dry_run(units: Sequence[Unit], work: Path, slots: int) -> CommandResult:
     """Count the units that are missing, and estimate how long they take."""
-    from outlap.experiments.runner import estimate_seconds, finished_rates
+    from outlap.experiments.runner import missing_work
 
-    missing = [unit for unit in units if not unit.is_done(work)]
-    counts = {kind: sum(unit.kind == kind for unit in missing) for kind in dict.fromkeys(unit.kind for unit in units)}
-    seconds = estimate_seconds(missing, finished_rates(work), slots, {})
+    counts, seconds = missing_work(units, work, slots)
     data = {"units": len(units), "missing": counts, "estimated_seconds": None if seconds is None else round(seconds)}
-
-    def show(console: Console) -> None:
-        for kind, count in counts.items():
-            console.print(f"{count:5} {kind}")
-        about = "" if seconds is None else f"about {duration(seconds)}; "
-        console.print(f"{about}{len(units) - len(missing)} of {len(units)} are done")
-
-    return CommandResult(data, show)
+    about = "" if seconds is None else f"about {duration(seconds)}; "
+    kinds = (f"{count:5} {kind}" for kind, count in counts.items())
+    return CommandResult(data, lines(*kinds, f"{about}{len(units) - sum(counts.values())} of {len(units)} are done"))
 
 
 def _print(console: Console, data: Mapping[str, Any], folder: Path) -> None:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
     for name, methods in data["tables"].items():
         metrics = [metric for metric in SHOWN if metric in next(iter(methods.values()))]
         title = f"{name}; {data['record']['circuits'][name].title}"
-        table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-        table.add_column("method")
-        for metric in metrics:
-            table.add_column(Text(SHOWN[metric]), justify="right")
-        for method, row in methods.items():
-            table.add_row(Text(method), *(_cell(row[metric]) for metric in metrics))
-        console.print(table)
+        rows = [(method, *(_cell(row[metric]) for metric in metrics)) for method, row in methods.items()]
+        console.print(table(("method", *(SHOWN[metric] for metric in metrics)), rows, left=("method",), title=title))
     console.print("mean over seeds [95 % interval], (the paper)", style="dim")
     console.print(f"report: {folder / 'report.html'}")

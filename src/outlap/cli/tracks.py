@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from pydantic.dataclasses import dataclass
 from tyro.conf import Positional, arg
 
 from outlap.cli.command import Command, Flag
-from outlap.cli.output import CommandResult
+from outlap.cli.output import CommandResult, lines, table
 from outlap.errors import OutlapError
+from outlap.files import make_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -28,17 +30,7 @@ class ListTracks(Command):
     def run(self) -> CommandResult:
         from outlap.track.catalog import list_tracks
 
-        rows = []
-        for entry in list_tracks():
-            row: dict[str, Any] = {"name": entry.name, "source": entry.source}
-            if entry.split is not None:
-                row["split"] = entry.split
-            row |= {"length_m": None, "path": entry.path}
-            try:
-                row["length_m"] = round(entry.length(), 3)
-            except (OutlapError, OSError) as error:
-                row["error"] = str(error)
-            rows.append(row)
+        rows = [entry.summary() for entry in list_tracks()]
         return CommandResult({"tracks": rows}, lambda console: _print_list(console, rows))
 
 
@@ -61,18 +53,9 @@ class ShowTrack(Command):
             raise OutlapError(f"--out is {out}; must be a file that ends in .png, .pdf or .svg")
         from outlap.viewer.plots import draw_track  # Matplotlib: not before it is needed
 
-        try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            draw_track(track, out)
-        except OSError as error:
-            raise OutlapError(f"--out {out}: cannot be written: {error.strerror}") from error
-        data = _describe(track) | {"picture": out}
-
-        def show(console: Console) -> None:
-            _print_summary(console, data)
-            _print(console, f"picture: {out}")
-
-        return CommandResult(data, show)
+        draw_track(track, make_folder(out.parent) / out.name)
+        data = track.summary() | {"picture": out}
+        return CommandResult(data, lines(_summary(data), f"picture: {out}"))
 
 
 @dataclass(frozen=True)
@@ -104,6 +87,7 @@ class GenerateTrack(Command):
     """The track's name; by default that of the folder, or generated-SEED."""
 
     def run(self) -> CommandResult:
+        from outlap.track import write_track
         from outlap.track.generate import generate_track
 
         if self.clockwise and self.anticlockwise:
@@ -112,15 +96,11 @@ class GenerateTrack(Command):
         name = self.name or folder_name or f"generated-{self.seed}"
         out = self.out or Path(name)
         _require_empty(out)
+        clockwise = self.clockwise if self.clockwise or self.anticlockwise else None
         track = generate_track(
-            self.seed,
-            length=self.length,
-            width=self.width,
-            min_radius=self.min_radius,
-            name=name,
-            clockwise=True if self.clockwise else False if self.anticlockwise else None,
+            self.seed, length=self.length, width=self.width, min_radius=self.min_radius, name=name, clockwise=clockwise
         )
-        return _written(track, _save(track, out), "folder")
+        return _written(track, write_track(track, out), "folder")
 
 
 @dataclass(frozen=True)
@@ -146,6 +126,7 @@ class ImportTrack(Command):
     """Replace a track that is there already."""
 
     def run(self) -> CommandResult:
+        from outlap.track import write_track
         from outlap.track.cache import cache_folder, install, staging
 
         track = self._read()
@@ -154,9 +135,9 @@ class ImportTrack(Command):
         if self.out is not None:
             if not self.force:
                 _require_empty(self.out)
-            return _written(track, _save(track, self.out), "folder")
+            return _written(track, write_track(track, self.out), "folder")
         with staging(cache_folder()) as prepared:
-            folder = _save(track, prepared / "track")  # refuses a name that cannot be a folder's
+            folder = write_track(track, prepared / "track")  # refuses a name that cannot be a folder's
             target = cache_folder() / track.name
             if target.exists() and not self.force:
                 raise OutlapError(f"{target}: this name is taken; give another --name, or --force to replace the track")
@@ -204,28 +185,14 @@ class DownloadTracks(Command):
             raise OutlapError(f"give the names of tracks, or --all; the official ones are {official}")
         if "{name}" not in self.url:
             raise OutlapError(f"--url is {self.url}; must hold {{name}} where the track's name goes")
-        tracks = download_tracks(
-            OFFICIAL_TRACKS if self.all else self.names,
-            url_template=self.url,
-            update_lock=self.update_lock,
-            show_progress=True,
-        )
+        names = OFFICIAL_TRACKS if self.all else self.names
+        tracks = download_tracks(names, url_template=self.url, update_lock=self.update_lock, show_progress=True)
         rows = [
-            {
-                "name": track.name,
-                "status": track.status,
-                "path": track.path,
-                "url": track.archive.url,
-                "sha256": track.archive.sha256,
-                "size_bytes": track.archive.size_bytes,
-            }
+            {"name": track.name, "status": track.status, "path": track.path}
+            | track.archive.model_dump(exclude={"date"})
             for track in tracks
         ]
-
-        def show(console: Console) -> None:
-            for track in tracks:
-                _print(console, f"{track.name} {track.status}: {track.path}")
-
+        show = lines(*(f"{track.name} {track.status}: {track.path}" for track in tracks))
         return CommandResult({"tracks": rows}, show)
 
 
@@ -234,79 +201,40 @@ def _require_empty(folder: Path) -> None:
         raise OutlapError(f"--out {folder}: is there already; must be an empty or a new folder")
 
 
-def _save(track: Track, folder: Path) -> Path:
-    from outlap.track import write_track
-
-    try:
-        return write_track(track, folder)
-    except OSError as error:
-        raise OutlapError(f"{folder}: cannot be written: {error.strerror}") from error
-
-
-def _describe(track: Track) -> dict[str, Any]:
-    import numpy as np
-
-    line = track.centerline
-    s = np.arange(0.0, line.length, 0.05)
-    right, left = line.widths(s)
-    widths = right + left
-    return {
-        "name": track.name,
-        "length_m": round(line.length, 3),
-        "min_radius_m": round(float(1.0 / np.max(np.abs(line.curvature(s)))), 3),
-        "mean_width_m": round(float(np.mean(widths)), 3),
-        "min_width_m": round(float(np.min(widths)), 3),
-        "clockwise": bool(np.sum(line.curvature(s)) < 0.0),
-        "raceline": track.raceline is not None,
-    }
-
-
 def _written(track: Track, folder: Path, kind: str) -> CommandResult:
-    data = _describe(track) | {"path": folder}
+    data = track.summary() | {"path": folder}
     usable_as = folder
-    note = ""
+    notes = []
     if kind == "cache":
         from outlap.track.catalog import find_entry
 
         usable_as = track.name
         found = find_entry(track.name)
         if found.path != folder:
-            note = f"note: {found.path} has this name too and is found first; give another --name"
+            notes.append(f"note: {found.path} has this name too and is found first; give another --name")
 
-    def show(console: Console) -> None:
-        _print_summary(console, data)
-        _print(console, f"written to: {folder}")
-        console.print(f"to see it: outlap tracks show '{usable_as}'")
-        if note:
-            _print(console, note)
-
-    return CommandResult(data, show)
+    written = (f"written to: {folder}", f"to see it: outlap tracks show '{usable_as}'")
+    return CommandResult(data, lines(_summary(data), *written, *notes))
 
 
 def _print_list(console: Console, rows: list[dict[str, Any]]) -> None:
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table("track", "source", "length [m]", "path")
-    table.columns[2].justify = "right"
-    table.columns[3].overflow = "fold"
-    for row in rows:
-        source = row["source"] + (f" ({row['split'].replace('_', '-')})" if "split" in row else "")
-        length = "" if row["length_m"] is None else f"{row['length_m']:.1f}"
-        place = Text(row["error"], style="red") if "error" in row else Text(str(row["path"] or ""))
-        table.add_row(Text(row["name"]), source, length, place)
-    console.print(table)
+    cells = [
+        (
+            row["name"],
+            row["source"] + (f" ({row['split'].replace('_', '-')})" if "split" in row else ""),
+            "" if row["length_m"] is None else f"{row['length_m']:.1f}",
+            Text(row["error"], style="red") if "error" in row else row["path"] or "",
+        )
+        for row in rows
+    ]
+    console.print(table(("track", "source", "length [m]", "path"), cells, left=("track", "source", "path")))
 
 
-def _print_summary(console: Console, data: dict[str, Any]) -> None:
+def _summary(data: dict[str, Any]) -> str:
     way = "clockwise" if data["clockwise"] else "anticlockwise"
-    _print(
-        console,
+    return (
         f"{data['name']}: {data['length_m']:.1f} m {way}, tightest radius {data['min_radius_m']:.2f} m, "
-        f"width {data['mean_width_m']:.2f} m (least {data['min_width_m']:.2f} m)",
+        f"width {data['mean_width_m']:.2f} m (least {data['min_width_m']:.2f} m)"
     )
-
-
-def _print(console: Console, line: str) -> None:
-    """One line as it is: a path is never broken, and brackets in it are not markup."""
-    console.print(line)

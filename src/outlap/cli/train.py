@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import shlex
 import sys
-import time
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Self, get_type_hints
 
+from pydantic.dataclasses import dataclass
 from tyro.conf import arg
 
 from outlap.cli.command import LongCommand
-from outlap.cli.interrupts import NOTHING_KEPT
-from outlap.cli.output import CommandResult
+from outlap.cli.output import NOTHING_KEPT, CommandResult, dated_folder, lines
 from outlap.cli.progress import progress_bar
 from outlap.config import load_config
 from outlap.errors import OutlapError
@@ -23,8 +22,6 @@ from outlap.training.ppo import PPOConfig, RecurrentPPOConfig
 from outlap.training.run import Run, load_run
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from outlap.training.callback import Progress
 
 
@@ -32,7 +29,6 @@ if TYPE_CHECKING:
 class _Train(LongCommand):
     """What the trainings of all algorithms have in common; each says what its `settings` are."""
 
-    config_class: ClassVar[type[TrainingConfig]]
     settings: TrainingConfig
 
     config: Path | None = None
@@ -47,7 +43,8 @@ class _Train(LongCommand):
     @classmethod
     def from_config(cls, path: Path) -> Self:
         """The defaults of `--config`."""
-        return cls(settings=load_config(cls.config_class, path))
+        settings_class: type[TrainingConfig] = get_type_hints(cls)["settings"]
+        return cls(settings=load_config(settings_class, path))
 
     def run(self) -> CommandResult:
         settings, name = self.settings, self.settings.algorithm
@@ -57,7 +54,7 @@ class _Train(LongCommand):
         if resumed and resumed.config.algorithm != name:
             raise OutlapError(f"--resume {self.resume}: was trained with {resumed.config.algorithm}, not {name}")
         config = resumed.config if resumed else settings
-        folder = resumed.folder if resumed else self.out or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
+        folder = resumed.folder if resumed else self.out or dated_folder(Path("runs"), f"{name}-")
         run = train_with_progress(config, folder, resumed, self.quiet)
         return training_result(run)
 
@@ -70,7 +67,6 @@ class TrainPPO(_Train):
     --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
     """
 
-    config_class = PPOConfig
     settings: Annotated[PPOConfig, arg(name="")] = field(default_factory=PPOConfig)
 
 
@@ -82,7 +78,6 @@ class TrainRecurrentPPO(_Train):
     --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
     """
 
-    config_class = RecurrentPPOConfig
     settings: Annotated[RecurrentPPOConfig, arg(name="")] = field(default_factory=RecurrentPPOConfig)
 
 
@@ -94,7 +89,6 @@ class TrainMQL(_Train):
     --env.vehicle.mu 0.5 1.1. Without --env.tracks it trains on the built-in circuits.
     """
 
-    config_class = MQLConfig
     settings: Annotated[MQLConfig, arg(name="")] = field(default_factory=MQLConfig)
 
 
@@ -126,18 +120,12 @@ def training_result(run: Run) -> CommandResult:
     """What `outlap train` prints and writes about a finished run."""
     record = run.record()
     data = {
-        "run": run.folder,
-        "policy": run.policy_path,
-        "steps": record["steps"],
-        "seconds": record["seconds"],
+        "run": run.folder, "policy": run.policy_path, "steps": record["steps"], "seconds": record["seconds"],
         "env_steps_per_second": record["steps_per_second"],
-    }
-
-    def show(console: Console) -> None:
-        console.print(
-            f"trained {data['steps']:,} steps in {data['seconds']} s ({data['env_steps_per_second']:,} steps/s)",
-        )
-        console.print(f"run folder: {run.folder}")
-        console.print(f"evaluate it: outlap evaluate {run.folder}")
-
+    }  # fmt: skip
+    show = lines(
+        f"trained {data['steps']:,} steps in {data['seconds']} s ({data['env_steps_per_second']:,} steps/s)",
+        f"run folder: {run.folder}",
+        f"evaluate it: outlap evaluate {run.folder}",
+    )
     return CommandResult(data, show)

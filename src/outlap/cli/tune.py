@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from pydantic.dataclasses import dataclass
 from tyro.conf import Positional, arg
 
-from outlap.cli.output import CommandResult
+from outlap.cli.output import CommandResult, table
 from outlap.cli.work import WorkCommand
 
 if TYPE_CHECKING:
@@ -51,16 +51,12 @@ class Tune(WorkCommand):
         data = {"trials": found.to_dict("records"), "best": path, "best_run": run, "folder": folder}
 
         def show(console: Console) -> None:
-            from rich import box
-            from rich.table import Table
-
-            table = Table(box=box.SIMPLE_HEAD)
             shown = found.drop(columns=["progress_low_m", "progress_high_m"]) if config.seeds == 1 else found
-            for name in shown.columns:
-                table.add_column(str(name), justify="right", overflow="fold")
-            for row in shown.head(SHOWN).itertuples(index=False):
-                table.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row))
-            console.print(table)
+            rows = [
+                [f"{value:.4g}" if isinstance(value, float) else value for value in row]
+                for row in shown.head(SHOWN).itertuples(index=False)
+            ]
+            console.print(table([str(name) for name in shown.columns], rows))
             console.print(f"the best run: {run}")
             console.print(f"train with the best: outlap train {best.config.algorithm} --config {path}")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from outlap.cli.arguments import check_least
-from outlap.cli.command import LongCommand
+from pydantic.dataclasses import dataclass
+
+from outlap.cli.command import CountOrZero, LongCommand, Share
 from outlap.errors import OutlapError
 from outlap.files import make_folder
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class WorkCommand(LongCommand):
     """A command that does units of work, on this machine or on a Ray cluster."""
 
-    jobs: int = 0
+    jobs: CountOrZero = 0
     """Units of work at a time; 0: one a core."""
 
     engine: Literal["local", "ray"] = "local"
@@ -35,14 +35,11 @@ class WorkCommand(LongCommand):
     store: str | None = None
     """Where machines of a Ray cluster that have no folder in common keep finished work: s3://bucket/folder, gs://…"""
 
-    gpu_share: float = 1.0
+    gpu_share: Share = 1.0
     """Of a GPU, for each training on one (device cuda) that Ray does."""
 
     def check_flags(self) -> None:
         """Raise OutlapError for a wrong flag."""
-        check_least("--jobs", self.jobs, 0)
-        if not 0.0 < self.gpu_share <= 1.0:
-            raise OutlapError(f"--gpu-share is {self.gpu_share}; must be > 0 and at most 1")
         for flag, value in (("--address", self.address), ("--store", self.store)):
             if self.engine == "local" and value is not None:
                 raise OutlapError(f"{flag} is of the engine ray alone; add --engine ray, or leave it out")

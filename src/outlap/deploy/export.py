@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import logging
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -41,6 +42,7 @@ ON_A_CAR = ("scan", "vel", "heading", PREVIOUS_ACTION, PREVIOUS_REWARD, "action_
 TOLD_BY_THE_CAR = ("progress", "steering_change", "speed_change")  # rewards that a car can estimate,
 NEVER_WHILE_DRIVING = ("collision", "stall", "overtake", "overtaken")  # and those of rare events, which it leaves out
 OPSET = 18
+LARGEST_DIFFERENCE = 1e-5  # of an action, between the file and the policy
 
 
 def export_policy(run: Run, path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -296,3 +298,28 @@ def compare(
 
 def _as_trained(name: str, value: np.ndarray, scaled: bool) -> np.ndarray:
     return np.divide(value, scale_of(name, value.shape[1]), dtype=np.float32) if scaled else value
+
+
+def export_and_compare(run: Run, path: Path, steps: int, on_step: Callable[[int], None]) -> dict[str, Any]:
+    """Write a run's policy as an ONNX file, compare both, and return what the file says and how far they differ.
+
+    Args:
+        run: whose policy it is.
+        path: of the file; removed again if it differs from the policy by more than `LARGEST_DIFFERENCE`.
+        steps, on_step: see `compare`; called every 50 steps.
+
+    Raises OutlapError for a file that differs, and what `export_policy` raises.
+    """
+    from outlap.deploy.car_driver import CarDriver
+
+    facts = export_policy(run, path)
+    of_action, of_command = compare(
+        run, CarDriver(path), steps, on_step=lambda done: on_step(done) if done % 50 == 0 else None
+    )
+    if not of_action <= LARGEST_DIFFERENCE or math.isnan(of_command):  # NaN is not either
+        path.unlink()
+        raise OutlapError(
+            f"{run.folder}: the file differs from the policy by {of_action:.2g} in its actions and "
+            f"{of_command:.2g} in its commands; please report this"
+        )
+    return {"largest_action_difference": of_action, "largest_command_difference": of_command, **facts}

@@ -6,7 +6,7 @@ more, the seed is the unit of the intervals; else it is the episode, and they ho
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,17 @@ import numpy as np
 import pandas as pd
 
 from outlap.drivers.driver import Driver
+from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
+from outlap.evaluation.protocol import made_for
 from outlap.evaluation.results import ROWS, write_rows
+from outlap.evaluation.rollout import evaluate
 from outlap.evaluation.statistics import Estimate, estimate_mean, paired_difference, wilson_interval
 from outlap.experiments.document import Document
 from outlap.experiments.figures import draw_intervals
 from outlap.experiments.results import METRICS, PAPER_EPISODES, RACING, claim_of, seed_scores
 from outlap.files import atomic_write, to_json
+from outlap.track.track import Track
 from outlap.training.run import Run
 
 SKIPPED = ("episode_length", "reward")  # of the paper's short races
@@ -77,6 +81,39 @@ def group(subjects: Sequence[Subject]) -> dict[str, list[Subject]]:
         label if labels.count(label) == 1 else f"{label} #{number + 1}": each
         for number, (label, each) in enumerate(zip(labels, found.values(), strict=True))
     }
+
+
+def race_subjects(
+    groups: Mapping[str, Sequence[Subject]],
+    races: RaceConfig,
+    tracks: Sequence[Track],
+    episodes: int,
+    seed: int,
+    on_progress: Callable[[int, str], None],
+) -> pd.DataFrame:
+    """Race every subject on the same episodes.
+
+    Args:
+        groups: of `group`.
+        races: the task; of a driver with a scanner and a top speed of its own, those stay.
+        tracks: to race on.
+        episodes: on each track.
+        seed: of the episodes.
+        on_progress: called with the number of episodes that are done, all together, and the subject's name.
+
+    Returns:
+        The rows of `evaluate`, with `method`, `training_seed` and `task`.
+    """
+    rows: list[pd.DataFrame] = []
+    for method, members in groups.items():
+        for subject in members:
+            before = len(rows) * len(tracks) * episodes
+            raced = evaluate(
+                subject.driver, made_for(subject.driver, races), tracks, episodes, seed, lap_time_ratios=False,
+                on_progress=lambda now, before=before, name=subject.name: on_progress(before + int(now.done), name),
+            )  # fmt: skip
+            rows.append(raced.assign(method=method, training_seed=subject.seed, task=raced["track"]))
+    return pd.concat(rows, ignore_index=True)
 
 
 def compare(rows: pd.DataFrame, methods: Sequence[str], alone: bool) -> tuple[dict[str, Any], list[Difference], bool]:

@@ -14,9 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from outlap.errors import OutlapError
 from outlap.evaluation.statistics import estimate_mean, performance_profile
 from outlap.experiments.results import METRICS, TableResult
 from outlap.figure_style import COLOURS, INK, WIDTH, entitle, finish, new_figure
+from outlap.training.run import load_run
 
 RULES = {"none": "no clip", "fixed": "fixed clip", "abc": "ABC", "uniform": "β = 1"}
 RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uniform": COLOURS[7]}
@@ -219,3 +221,23 @@ def read_learning(folder: Path) -> pd.DataFrame:
         return pd.DataFrame(columns=["step", *names])
     columns = {name: {event.step: event.value for event in log.Scalars(tag)} for name, tag in names.items()}
     return pd.DataFrame(columns).rename_axis("step").sort_index().reset_index()
+
+
+def learning_curves(names: Sequence[str]) -> dict[str, list[pd.DataFrame]]:
+    """Return the learning curves of runs by method; a method is called by its first run.
+
+    Raises OutlapError for a name that is no run folder, and for a run without a curve.
+    """
+    runs = [load_run(name) for name in names]
+    short = [run.folder.resolve().name for run in runs]
+    titles = short if len(set(short)) == len(short) else [str(run.folder) for run in runs]
+    methods: dict[str, list[tuple[str, pd.DataFrame]]] = {}
+    for title, run in zip(titles, runs, strict=True):
+        curve = read_learning(run.folder)
+        if not len(curve):
+            raise OutlapError(f"{run.folder}: has no learning curve yet; train longer, or leave it out")
+        methods.setdefault(run.method, []).append((title, curve))
+    return {
+        members[0][0] + (f" ({len(members)} seeds)" if len(members) > 1 else ""): [curve for _, curve in members]
+        for members in methods.values()
+    }

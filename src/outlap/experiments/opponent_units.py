@@ -110,6 +110,18 @@ def enter_all(
     return found
 
 
+def parse_speeds(text: str) -> list[float]:
+    """Return the top speeds [m/s] of a text first:last:step. Raise OutlapError for any other text."""
+    try:
+        first, last, step = (float(word) for word in text.split(":"))
+        count = math.floor((last - first) / step + 1e-6)
+        if step <= 0.0 or count < 0:
+            raise ValueError
+    except (ValueError, ArithmeticError):
+        raise OutlapError(f"--speeds is {text!r}; must be first:last:step, such as 2.0:6.0:0.5") from None
+    return [round(first + i * step, 6) for i in range(count + 1)]
+
+
 def name_opponents(track: str, speeds: Sequence[float], held_out: Sequence[float]) -> list[Opponent]:
     """Return the opponents to train, named after their track and top speed.
 

@@ -175,3 +175,16 @@ def estimate_seconds(
             return None
         left.append(unit.size * rates[unit.category] * (1.0 - shares.get(unit.key, 0.0)))
     return max(sum(left) / slots, max(left, default=0.0))  # the last units do not fill all slots
+
+
+def missing_work(units: Sequence[Unit], work: Path, slots: int) -> tuple[dict[str, int], float | None]:
+    """Return how many units of each kind are not done, and how long they take [s]; None if that cannot be estimated.
+
+    Args:
+        units: to count.
+        work: their folder.
+        slots: units at a time.
+    """
+    missing = [unit for unit in units if not unit.is_done(work)]
+    counts = {kind: sum(unit.kind == kind for unit in missing) for kind in dict.fromkeys(unit.kind for unit in units)}
+    return counts, estimate_seconds(missing, finished_rates(work), slots, {})

@@ -8,7 +8,7 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from outlap.errors import OutlapError
 from outlap.track import map_io
@@ -53,6 +53,15 @@ class TrackEntry:
         if self.path is None:
             return (TRAINING_CIRCUITS | HELD_OUT_CIRCUITS)[self.name].length
         return map_io.read_centerline_csv(map_io.find_centerline_csv(self.path, self.name)).length
+
+    def summary(self) -> dict[str, Any]:
+        """Return name, source, split if it has one, length [m], path, and the error of a track that cannot be read."""
+        split = {} if self.split is None else {"split": self.split}
+        row: dict[str, Any] = {"name": self.name, "source": self.source, **split, "length_m": None, "path": self.path}
+        try:
+            return row | {"length_m": round(self.length(), 3)}
+        except (OutlapError, OSError) as error:
+            return row | {"error": str(error)}
 
 
 def load_track(path_or_name: str | os.PathLike[str]) -> Track:

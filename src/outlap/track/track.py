@@ -45,6 +45,22 @@ class Track:
         object.__setattr__(self, "occupancy", occupancy)
         object.__setattr__(self, "origin", tuple(map(float, self.origin)))
 
+    def summary(self) -> dict[str, str | float | bool]:
+        """Return length, tightest radius, widths [m] and direction of the centreline, and if there is a racing line."""
+        line = self.centerline
+        s = np.arange(0.0, line.length, 0.05)
+        right, left = line.widths(s)
+        curvature = line.curvature(s)
+        return {
+            "name": self.name,
+            "length_m": round(line.length, 3),
+            "min_radius_m": round(float(1.0 / np.max(np.abs(curvature))), 3),
+            "mean_width_m": round(float(np.mean(right + left)), 3),
+            "min_width_m": round(float(np.min(right + left)), 3),
+            "clockwise": bool(np.sum(curvature) < 0.0),
+            "raceline": self.raceline is not None,
+        }
+
     def reversed(self) -> Track:
         """The same circuit driven the other way round; the racing line, made for this way, is left out."""
         line = self.centerline

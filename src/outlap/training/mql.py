@@ -23,6 +23,7 @@ class MQLConfig(TrainingConfig, TD3Config):
     policy_name = "MQLPolicy"
 
     algorithm: Literal["mql"] = "mql"  # type: ignore[assignment]
+    """What trains."""
     env: RaceConfig = PPOConfig().env.model_copy(
         update={
             "observation": ("scan", "vel", "heading", "previous_action", "previous_reward"),

@@ -26,6 +26,7 @@ class PPOConfig(TrainingConfig):
     policy_name = "MultiInputPolicy"
 
     algorithm: Literal["ppo"] = "ppo"  # type: ignore[assignment]
+    """What trains."""
     env: RaceConfig = RaceConfig(
         augment_tracks=True,
         beams=108,
@@ -77,6 +78,7 @@ class RecurrentPPOConfig(PPOConfig):
     policy_name = "MultiInputLstmPolicy"
 
     algorithm: Literal["recurrent-ppo"] = "recurrent-ppo"  # type: ignore[assignment]
+    """What trains."""
     lstm_hidden: int = Field(default=64, ge=1)
 
     def network(self) -> dict[str, Any]:
