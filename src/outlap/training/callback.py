@@ -23,7 +23,6 @@ class Progress:
 
     steps: int
     total_steps: int
-    steps_per_second: float
     crash_rate: float | None  # of recent episodes
     mean_speed_mps: float | None
     progress_m: float | None
@@ -79,7 +78,6 @@ class TrainingCallback(BaseCallback):
                 Progress(
                     steps=steps,
                     total_steps=self._config.total_steps,
-                    steps_per_second=steps / self._clock.seconds,
                     crash_rate=numbers.get("crash_rate"),
                     mean_speed_mps=numbers.get("mean_speed_mps"),
                     progress_m=numbers.get("progress_m"),

@@ -20,7 +20,7 @@ from outlap.evaluation.rollout import evaluate
 from outlap.track.track import Track
 from outlap.training.model_file import load_model
 from outlap.training.ppo import PPOConfig
-from outlap.training.run import load_run
+from outlap.training.run import is_run, load_run
 from outlap.training.session import train
 
 SLOWEST = 0.5  # [m/s] that an opponent can command; one that may stop would rather stand than enter a corner
@@ -65,9 +65,7 @@ def enter(folder: Path, opponent: Opponent, rows: pd.DataFrame, track: str, laps
     member = None
     if (completed >= laps).all():
         member = Member(
-            name=opponent.name,
-            max_speed_mps=opponent.max_speed_mps,
-            split=opponent.split,
+            **vars(opponent),
             track=track,
             verified_laps=int(completed.min()),
             crash_rate=crash_rate(rows),
@@ -87,7 +85,7 @@ def crash_rate(rows: pd.DataFrame) -> float:
 def train_opponent(
     opponent: Opponent, settings: PPOConfig, track: str, folder: Path, on_steps: Callable[[int], None]
 ) -> MLPDriver:
-    """Train an opponent, or go on with its training.
+    """Train an opponent, or resume its training.
 
     Args:
         opponent: which.
@@ -101,7 +99,7 @@ def train_opponent(
         Its driver, not verified yet.
     """
     config = opponent_config(settings, track, opponent.max_speed_mps)
-    begun = load_run(folder) if (folder / "config.yaml").is_file() else None
+    begun = load_run(folder) if is_run(folder) else None
     run = train(config, folder, resume=begun, on_progress=lambda progress: on_steps(progress.steps))
     model: Any = load_model(run.config, run.policy_path)
     speeds = SLOWEST, opponent.max_speed_mps

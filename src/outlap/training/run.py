@@ -121,7 +121,7 @@ class Run:
     def note_pace(self, steps: int, seconds: float, **facts: Any) -> None:
         """Note in run.json how far the training is, and how long all its sessions together took so far."""
         self.write_record(
-            steps=steps, seconds=round(seconds, 1), steps_per_second=round(steps / max(seconds, 1e-9)), **facts
+            steps=steps, seconds=round(seconds, 2), steps_per_second=round(steps / max(seconds, 1e-9)), **facts
         )
 
     def record(self) -> dict[str, Any]:

@@ -141,7 +141,7 @@ class Scene:
 
     def follow(self, frame: Frame, car: int, scale: float | None = None) -> None:
         """Put a car in the middle; the scale stays, or is the one given."""
-        ((x, y),) = self._upright(frame.motion[[car]][:, [X, Y]])
+        x, y = self._place(frame, car)
         self.camera = Camera(float(x), float(y), scale or self.camera.scale)
 
     def nearby(self) -> float:
@@ -197,24 +197,23 @@ class Scene:
         moved = np.asarray(points, float) - (x, y)
         return np.column_stack([cos * moved[:, 0] + sin * moved[:, 1], cos * moved[:, 1] - sin * moved[:, 0]])
 
+    def _place(self, frame: Frame, car: int) -> np.ndarray:
+        """Return where a car is, (2,), in the frame of the map's pixels [m]."""
+        return self._upright(frame.motion[[car]][:, [X, Y]])[0]
+
     def _screen(self, points: np.ndarray, camera: Camera | None = None, size: tuple[int, int] | None = None):
-        """Upright points (n, 2) in pixels of the picture."""
-        camera, (width, height) = camera or self.camera, size or self.size
-        return np.column_stack(
-            [
-                (points[:, 0] - camera.x) * camera.scale + 0.5 * width,
-                0.5 * height - (points[:, 1] - camera.y) * camera.scale,
-            ]
-        )
+        """Return upright points (n, 2) in pixels of the picture."""
+        camera = camera or self.camera
+        return (points - (camera.x, camera.y)) * camera.scale * (1.0, -1.0) + 0.5 * np.array(size or self.size)
 
     def _polyline(
         self, points: np.ndarray, colour: str | tuple[int, ...], closed: bool = False, width: int = 1
     ) -> None:
         pixels = self._screen(np.vstack([points, points[:1]]) if closed else points)
         # Far beyond the edges nothing is drawn, and coordinates do not overflow.
-        near = (np.abs(pixels - 0.5 * np.array(self.size)) < 2 * np.array(self.size)).all(axis=1)
-        for piece in np.split(pixels, np.flatnonzero(np.diff(near)) + 1):
-            inside = (np.abs(piece[0] - 0.5 * np.array(self.size)) < 2 * np.array(self.size)).all()
+        near = np.all(np.abs(pixels - 0.5 * np.array(self.size)) < 2 * np.array(self.size), axis=1)
+        ends = np.flatnonzero(np.diff(near)) + 1
+        for piece, inside in zip(np.split(pixels, ends), near[[0, *ends]], strict=True):
             if inside and len(piece) > 1:
                 if width == 1:
                     pygame.draw.aalines(self.surface, colour, False, piece.tolist())
@@ -230,9 +229,9 @@ class Scene:
 
     def _draw_car(self, entry: Entry, car: int, colour: str) -> None:
         length, width = entry.cast.sizes[car]
-        x, y, yaw, steer = entry.frame.motion[car, [X, Y, YAW, STEER]]
+        yaw, steer = entry.frame.motion[car, [YAW, STEER]]
         grow = max(1.0, SMALLEST_CAR / (length * self.camera.scale))
-        (middle,) = self._screen(self._upright(np.array([[x, y]])))
+        (middle,) = self._screen(self._place(entry.frame, car)[None])
         yaw = yaw - self.track.origin[2]
 
         def polygon(corners: np.ndarray, fill: str, at: tuple[float, float] = (0.0, 0.0), turn: float = 0.0) -> None:
@@ -273,12 +272,9 @@ class Scene:
         for entry, colour in coloured:
             for car in reversed(range(len(entry.cast.drivers))):
                 if entry.frame.contact[car] != REMOVED:
-                    place = self._screen(
-                        self._upright(entry.frame.motion[[car]][:, [X, Y]]), camera, surface.get_size()
-                    )[0]
-                    pygame.draw.aacircle(
-                        self.surface, colour if car == EGO else RIVAL_GREY, (place + corner).tolist(), 4
-                    )
+                    (place,) = self._screen(self._place(entry.frame, car)[None], camera, surface.get_size())
+                    fill = colour if car == EGO else RIVAL_GREY
+                    pygame.draw.aacircle(self.surface, fill, (place + corner).tolist(), 4)
 
     def _draw_board(self, coloured: Sequence[tuple[Entry, str]]) -> None:
         """Time, and of every car its place, speed, laps and last lap."""
