@@ -20,12 +20,6 @@ ORDER = (
 LONGEST_MODULE, LONGEST_FUNCTION = 400, 60  # lines
 FRONT_DOORS = ("outlap", "outlap.__main__")  # may import any package, and nothing imports them
 
-# What the code does not keep to yet; to be empty.
-UPWARDS: set[str] = set()
-IN_CYCLES: set[str] = set()
-LONG_MODULES: set[str] = set()
-LONG_FUNCTIONS: set[str] = set()
-
 
 @cache
 def modules() -> dict[str, Path]:
@@ -67,11 +61,11 @@ def test_a_package_imports_only_the_packages_before_it() -> None:
         for imported in imports(name)
         if imported in FRONT_DOORS or ORDER.index(package(name)) < ORDER.index(package(imported))
     }
-    assert upwards == UPWARDS
+    assert not upwards
 
 
 def test_no_modules_import_each_other() -> None:
-    assert {name for name in modules() if name in reached(name)} == IN_CYCLES
+    assert not {name for name in modules() if name in reached(name)}
 
 
 def reached(name: str) -> set[str]:
@@ -87,12 +81,12 @@ def reached(name: str) -> set[str]:
 
 def test_no_module_is_long() -> None:
     lengths = {name: len(path.read_text().splitlines()) for name, path in modules().items()}
-    assert {name for name, length in lengths.items() if length > LONGEST_MODULE} == LONG_MODULES
+    assert not {name for name, length in lengths.items() if length > LONGEST_MODULE}
 
 
 def test_no_function_is_long_outside_kernels() -> None:
     lengths = {where: length for name, path in modules().items() for where, length in functions(name, syntax(path))}
-    assert {where for where, length in lengths.items() if length > LONGEST_FUNCTION} == LONG_FUNCTIONS
+    assert not {where for where, length in lengths.items() if length > LONGEST_FUNCTION}
 
 
 def functions(name: str, tree: ast.Module) -> Iterator[tuple[str, int]]:
