@@ -38,8 +38,8 @@ def parse(command: type[CommandT], arguments: Sequence[str], prog: str) -> Comma
         default["default"] = from_config(path)
     complaint = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint), _no_line_breaks(arguments):
-            return tyro.cli(_own_flags_first(command), args=list(arguments), prog=prog, **default)
+        with contextlib.redirect_stderr(complaint), _no_line_breaks(arguments), _own_flags_first(command):
+            return tyro.cli(command, args=list(arguments), prog=prog, **default)
     except (SystemExit, ValidationError) as stop:  # tyro lets pass what a Config of all flags refuses
         if isinstance(stop, SystemExit) and not stop.code:
             raise
@@ -48,14 +48,20 @@ def parse(command: type[CommandT], arguments: Sequence[str], prog: str) -> Comma
     raise OutlapError(message)
 
 
-def _own_flags_first(command: type[CommandT]) -> type[CommandT]:
-    """Let the help list the flags of a command before those of its base classes."""
+@contextlib.contextmanager
+def _own_flags_first(command: type) -> Iterator[None]:
+    """Let tyro list the flags of a command before those of its base classes."""
     owners = [inspect.get_annotations(each) for each in command.__mro__]
     fields: dict[str, Any] = vars(command)["__dataclass_fields__"]
-    ordered = sorted(fields.items(), key=lambda item: [item[0] in owner for owner in owners].index(True))
-    fields.clear()
-    fields.update(ordered)
-    return command
+    before = dict(fields)
+    names = sorted(fields, key=lambda name: [name in owner for owner in owners].index(True))
+    try:
+        for name in names:
+            fields[name] = fields.pop(name)
+        yield
+    finally:
+        fields.clear()
+        fields.update(before)
 
 
 def _config_file(arguments: Sequence[str]) -> str | None:
