@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from outlap.drivers.driver import Driver
 from outlap.envs.race_config import RaceConfig
@@ -23,7 +24,7 @@ from outlap.evaluation.rollout import evaluate
 from outlap.evaluation.statistics import Estimate, estimate_mean, paired_difference, wilson_interval
 from outlap.experiments.document import Document
 from outlap.experiments.figures import draw_intervals
-from outlap.experiments.results import METRICS, PAPER_EPISODES, RACING, claim_of, seed_scores
+from outlap.experiments.results import METRICS, PAPER_EPISODES, Difference, difference, metrics_of, seed_scores
 from outlap.files import atomic_write, to_json
 from outlap.track.track import Track
 from outlap.training.run import Run
@@ -48,19 +49,6 @@ class Subject:
     def method(self) -> str:
         """What tells it from other methods; of one that was not trained, its name."""
         return self.name if self.run is None else self.run.method
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A method against the first one, in one metric."""
-
-    metric: str
-    method: str
-    other: str
-    difference: float
-    low: float
-    high: float
-    claim: str
 
 
 def group(subjects: Sequence[Subject]) -> dict[str, list[Subject]]:
@@ -127,7 +115,7 @@ def compare(rows: pd.DataFrame, methods: Sequence[str], alone: bool) -> tuple[di
     Returns:
         Estimates by method and metric; the differences; whether the seed is the unit.
     """
-    metrics = [name for name in METRICS if name not in SKIPPED and not (alone and name in RACING)]
+    metrics = [name for name in metrics_of(1 if alone else 2) if name not in SKIPPED]
     of_method = {method: rows.loc[rows["method"] == method] for method in methods}
     seeds = {method: set(mine["training_seed"].tolist()) for method, mine in of_method.items()}
     by_seed = min(map(len, seeds.values())) > 1
@@ -145,22 +133,20 @@ def compare(rows: pd.DataFrame, methods: Sequence[str], alone: bool) -> tuple[di
         for method in methods[1:] if METRICS[metric].better else ():
             paired = not by_seed or seeds[method] == seeds[first]
             estimate = _difference(values[method], values[first], paired)
-            better = METRICS[metric].better
-            claim = claim_of(better * estimate.low, better * estimate.high)
-            differences.append(Difference(metric, method, first, estimate.mean, estimate.low, estimate.high, claim))
+            differences.append(difference(metric, method, first, estimate))
     return cells, differences, by_seed
 
 
 def _values(rows: pd.DataFrame, metric: str, by_seed: bool) -> np.ndarray:
-    """(seeds, tasks), or (episodes, 1) in which the runs of a method are averaged."""
+    """Return (seeds, tasks), or (episodes, 1) in which the runs of a method are averaged."""
     if by_seed:
         return seed_scores(rows, METRICS[metric])
-    each = pd.DataFrame({"task": rows["task"], "seed": rows["seed"], "value": METRICS[metric].values(rows)})
-    return each.pivot_table(index=["task", "seed"], values="value", aggfunc="mean").to_numpy(np.float64)
+    values = rows.assign(value=METRICS[metric].values(rows))
+    return values.pivot_table(index=["task", "seed"], values="value").to_numpy(np.float64)
 
 
 def _of_crashes(rows: pd.DataFrame, estimate: Estimate) -> Estimate:
-    """The estimate with Wilson's interval, which has a width for no crash too."""
+    """Return the estimate with Wilson's interval, which has a width for no crash too."""
     crashed = METRICS["crashes"].of_rows(rows)
     low, high = wilson_interval(int(crashed.sum()), len(crashed))
     return estimate._replace(low=PAPER_EPISODES * low, high=PAPER_EPISODES * high)
@@ -170,8 +156,6 @@ def _difference(a: np.ndarray, b: np.ndarray, paired: bool) -> Estimate:
     if paired:
         return paired_difference(a, b)
     # Welch's interval: other seeds cannot be paired.
-    from scipy import stats
-
     left, right = a.mean(axis=1), b.mean(axis=1)
     low, high = stats.ttest_ind(left, right, equal_var=False).confidence_interval()
     return Estimate(float(left.mean() - right.mean()), float("nan"), float(low), float(high))
@@ -180,33 +164,22 @@ def _difference(a: np.ndarray, b: np.ndarray, paired: bool) -> Estimate:
 def write_comparison(
     folder: Path, rows: pd.DataFrame, groups: Mapping[str, Sequence[Subject]], alone: bool, record: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Write `report.md`, `report.html`, `results.json`, the figure and the rows; returns what the JSON holds."""
+    """Write `report.md`, `report.html`, `results.json`, the figure and the rows; return the content of the JSON."""
     methods = list(groups)
     cells, differences, by_seed = compare(rows, methods, alone)
-    document = Document(folder)
-    document.text(f"# {', '.join(methods)}")
     episodes = len(rows) // sum(len(each) for each in groups.values())
     unit = "the seed of a training" if by_seed else "the episode: it says nothing of other trainings of a method"
     tracks = ", ".join(dict.fromkeys(rows["task"].tolist()))
+    document = Document(folder)
+    document.text(f"# {', '.join(methods)}")
     document.text(f"{episodes} episodes on {tracks}, the same for everybody. The unit of intervals is {unit}.")
-    metrics = list(next(iter(cells.values())))
     document.table(
-        ["method", *(METRICS[metric].heading for metric in metrics)],
-        [[method, *(_cell(cells[method][metric], METRICS[metric].digits) for metric in metrics)] for method in methods],
+        {"method": method}
+        | {METRICS[name].heading: METRICS[name].text(each.mean, each.low, each.high) for name, each in row.items()}
+        for method, row in cells.items()
     )
     document.figure("comparison", draw_intervals(cells, ("crashes", "progress_m")))
-    document.table(
-        ["comparison", "metric", "difference [95 %]", "shown"],
-        [
-            [
-                f"{each.method} against {each.other}",
-                METRICS[each.metric].heading,
-                _signed(each, METRICS[each.metric].digits),
-                each.claim,
-            ]
-            for each in differences
-        ],
-    )
+    document.table(each.row({method: method for method in methods}) for each in differences)
     data = {
         "unit": "seed" if by_seed else "episode",
         "methods": {method: {name: each._asdict() for name, each in row.items()} for method, row in cells.items()},
@@ -218,13 +191,3 @@ def write_comparison(
     atomic_write(folder / "results.json", to_json(data) + "\n")
     document.save(", ".join(methods))
     return data
-
-
-def _cell(estimate: Estimate, digits: int) -> str:
-    interval = "" if np.isnan(estimate.low) else f" [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
-    return f"{estimate.mean:.{digits}f}{interval}"
-
-
-def _signed(each: Difference, digits: int) -> str:
-    interval = "" if np.isnan(each.low) else f" [{each.low:.{digits}f}, {each.high:.{digits}f}]"
-    return f"{each.difference:+.{digits}f}{interval}"

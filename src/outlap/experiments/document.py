@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -30,17 +30,17 @@ class Document:
         """Add paragraphs or headings."""
         self.blocks += blocks
 
-    def table(self, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table."""
-        lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
-        lines += ["| " + " | ".join(row) + " |" for row in rows]
-        self.blocks.append("\n".join(lines))
+    def table(self, rows: Iterable[Mapping[str, str]]) -> None:
+        """Add a table, unless it has no rows; each row is a text for each heading."""
+        rows = list(rows)
+        if rows:
+            lines = [f"| {' | '.join(cells)} |" for cells in (rows[0], *(row.values() for row in rows))]
+            self.blocks.append("\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]))
 
     def figure(self, name: str, figure: Figure) -> None:
         """Save a figure as PNG and SVG, and show it here."""
         for ending in ("png", "svg"):
-            path = self.folder / "figures" / f"{name}.{ending}"
-            save_figure(figure, path)
+            save_figure(figure, self.folder / "figures" / f"{name}.{ending}")
         self.blocks.append(f"![{name}](figures/{name}.png)")
 
     def save(self, title: str) -> None:

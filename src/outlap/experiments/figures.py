@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -15,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from outlap.errors import OutlapError
-from outlap.evaluation.statistics import estimate_mean, performance_profile
-from outlap.experiments.results import METRICS, TableResult
+from outlap.evaluation.statistics import Estimate, estimate_mean, performance_profile
+from outlap.experiments.results import METRICS, Cell, TableResult
 from outlap.figure_style import COLOURS, INK, WIDTH, entitle, finish, new_figure
 from outlap.training.run import load_run
 
@@ -25,19 +24,8 @@ RULE_COLOURS = {"none": COLOURS[4], "fixed": COLOURS[0], "abc": COLOURS[1], "uni
 POINTS = 60  # of a learning curve
 
 
-class Interval(Protocol):
-    """A mean with the ends of its interval."""
-
-    @property
-    def mean(self) -> float: ...
-    @property
-    def low(self) -> float: ...
-    @property
-    def high(self) -> float: ...
-
-
 def draw_intervals(
-    cells: Mapping[str, Mapping[str, Interval]],
+    cells: Mapping[str, Mapping[str, Estimate]] | Mapping[str, Mapping[str, Cell]],
     metrics: Sequence[str],
     titles: Mapping[str, str] | None = None,
     title: str = "",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import yaml
 
@@ -15,14 +15,14 @@ from outlap.evaluation.results import ROWS, write_rows
 from outlap.experiments import figures
 from outlap.experiments.document import Document
 from outlap.experiments.opponent_units import OpponentUnit
-from outlap.experiments.paper_units import COLLECTING_WORLDS, adaptation_settings
+from outlap.experiments.paper_units import COLLECTING_WORLDS, RaceUnit, adaptation_settings
 from outlap.experiments.plan import CLIPPING_TASKS, Plan
 from outlap.experiments.results import (
     METRICS,
     Cell,
-    Comparison,
     TableResult,
     entries,
+    interval_text,
     ratio_over_adaptations,
     read_rows,
     table_result,
@@ -68,7 +68,9 @@ def write_report(plan: Plan, folder: Path) -> dict[str, Any]:
             "would give in the time, is above τ.",
         )
         document.figure("profiles", figures.draw_profiles(results, titles, "How far every method comes"))
-        _write_effort(document, results, titles, work)
+        document.text("## What went into every method")
+        races = [race for table in plan.tables for race in table.races]
+        document.table(_effort(method, title, races, work) for method, title in titles.items())
     data: dict[str, Any] = {"tables": {result.plan.name: entries(result) for result in results}}
     data["comparisons"] = {result.plan.name: [asdict(each) for each in result.comparisons] for result in results}
     if plan.clipping:
@@ -122,61 +124,39 @@ def _write_table(document: Document, plan: Plan, work: Path, result: TableResult
     ours = [name for name in result.metrics if name not in paper]
     if paper:
         document.table(
-            ["method", *(heading for name in paper for heading in (METRICS[name].heading, "the paper"))],
-            [
-                [titles[method], *(text for name in paper for text in (_value(row[name], name), _published(row[name])))]
-                for method, row in result.cells.items()
-            ],
+            {"method": titles[method], **{key: text for name in paper for key, text in _reported(name, row[name])}}
+            for method, row in result.cells.items()
         )
     document.table(
-        ["method", *(METRICS[name].heading for name in ours), "IQM of progress [m]"],
-        [
-            [titles[method], *(_value(row[name], name) for name in ours), _iqm(row["progress_m"])]
-            for method, row in result.cells.items()
-        ],
+        {
+            "method": titles[method],
+            **{METRICS[name].heading: _value(name, row[name]) for name in ours},
+            "IQM of progress [m]": _iqm(row["progress_m"]),
+        }
+        for method, row in result.cells.items()
     )
     document.figure(table.name, figures.draw_intervals(result.cells, ("crashes", "progress_m"), titles, title))
     if result.comparisons:
         document.text("### What this shows")
-        document.table(
-            ["comparison", "metric", "difference [95 %]", "probability of improvement [95 %]", "shown"],
-            [_comparison(each, titles) for each in result.comparisons],
-        )
+        document.table(each.row(titles) for each in result.comparisons)
 
 
-def _value(cell: Cell, metric: str) -> str:
-    digits = METRICS[metric].digits
-    text = f"{cell.mean:.{digits}f}"
-    if not METRICS[metric].per_paper_episodes:
-        text += f" ± {cell.sd:.{digits}f}"
-    return f"{text} {_interval(cell.low, cell.high, digits)}"
+def _value(name: str, cell: Cell) -> str:
+    metric = METRICS[name]
+    sd = "" if metric.is_count else f" ± {cell.sd:.{metric.digits}f}"
+    return f"{cell.mean:.{metric.digits}f}{sd}{interval_text(cell.low, cell.high, metric.digits)}"
 
 
-def _interval(low: float, high: float, digits: int) -> str:
-    return "" if low != low else f"[{low:.{digits}f}, {high:.{digits}f}]"
-
-
-def _published(cell: Cell) -> str:
-    if cell.published is None:
-        return ""
-    if isinstance(cell.published, tuple):
-        return f"{cell.published[0]:g} ± {cell.published[1]:g}"
-    return f"{cell.published:g}"
+def _reported(name: str, cell: Cell) -> list[tuple[str, str]]:
+    """Return a number and that of the paper, each with its heading."""
+    published = cell.published if isinstance(cell.published, tuple) else (cell.published,)
+    text = " ± ".join(f"{number:g}" for number in published if number is not None)
+    heading = METRICS[name].heading
+    return [(heading, _value(name, cell)), (f"{heading}, the paper", text)]
 
 
 def _iqm(cell: Cell) -> str:
-    return f"{cell.iqm:.1f} {_interval(cell.iqm_low, cell.iqm_high, 1)}"
-
-
-def _comparison(each: Comparison, titles: Mapping[str, str]) -> list[str]:
-    digits = METRICS[each.metric].digits
-    return [
-        f"{titles[each.method]} against {titles[each.other]}",
-        METRICS[each.metric].heading,
-        f"{each.difference:+.{digits}f} {_interval(each.low, each.high, digits)}",
-        f"{each.probability:.2f} {_interval(each.probability_low, each.probability_high, 2)}",
-        f"**{each.claim}**" if each.claim != "not shown" else each.claim,
-    ]
+    return f"{cell.iqm:.1f}{interval_text(cell.iqm_low, cell.iqm_high, 1)}"
 
 
 def _read_clipping(plan: Plan, work: Path, name: str) -> pd.DataFrame:
@@ -215,36 +195,30 @@ def _write_clipping(document: Document, plan: Plan, work: Path) -> dict[str, Any
     labels = {name: label for name, label, *_ in numbers}
     document.text("Medians over all adaptations:")
     document.table(
-        ["number", *(figures.RULES[rule] for rule in CLIP_RULES)],
-        [[labels[name], *(_median(each[rule]) for rule in CLIP_RULES)] for name, each in found.items()],
+        {"number": labels[name], **{figures.RULES[rule]: _median(each[rule]) for rule in CLIP_RULES}}
+        for name, each in found.items()
     )
     document.text(
         f"ABC over another rule: geometric mean of the ratio [95 %]; the unit is the training, of which there are "
         f"{len({unit.seed for unit in plan.clipping})}. Below 1: ABC's is the smaller."
     )
     document.table(
-        ["number", "ABC over", "ratio", "the paper", "shown"],
-        [
-            [labels[name], figures.RULES[reference], *_ratio(each[f"abc_over_{reference}"])]
-            for name, each in found.items()
-            for reference in ("none", "fixed")
-        ],
+        {"number": labels[name], "ABC over": figures.RULES[other], **_ratio(each[f"abc_over_{other}"])}
+        for name, each in found.items()
+        for other in ("none", "fixed")
     )
     return found
 
 
 def _clipping_numbers(source: pd.DataFrame, column: str, paper: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Return the median of a number for each clip rule, and ABC's ratio to the others, with what the paper has."""
-    found: dict[str, dict[str, Any]] = {}
-    for rule in CLIP_RULES:
-        median = float(np.median(source.loc[source["rule"] == rule, column].to_numpy()))
-        found[rule] = {"value": median, "published": paper.get(rule)}
+    medians = source.groupby("rule")[column].median().to_dict()
+    found: dict[str, dict[str, Any]] = {
+        rule: {"value": medians[rule], "published": paper.get(rule)} for rule in CLIP_RULES
+    }
     for other in ("none", "fixed"):
         published = paper["abc"] / paper[other] if other in paper else None
-        found[f"abc_over_{other}"] = {
-            **ratio_over_adaptations(source, "abc", other, column),
-            "published": published,
-        }
+        found[f"abc_over_{other}"] = {**ratio_over_adaptations(source, "abc", other, column), "published": published}
     return found
 
 
@@ -253,30 +227,29 @@ def _median(number: Mapping[str, Any]) -> str:
     return f"{number['value']:.3g}{note}"
 
 
-def _ratio(ratio: Mapping[str, Any]) -> tuple[str, str, str]:
+def _ratio(ratio: Mapping[str, Any]) -> dict[str, str]:
     """Return a ratio with its interval, what the paper has, and what that shows."""
-    claim = "**smaller**" if ratio["high"] < 1.0 else "**larger**" if ratio["low"] > 1.0 else "not shown"
-    interval = f"{ratio['value']:.3g} [{ratio['low']:.3g}, {ratio['high']:.3g}]"
-    return interval, "" if ratio["published"] is None else f"{ratio['published']:.2g}", claim
+    return {
+        "ratio": f"{ratio['value']:.3g} [{ratio['low']:.3g}, {ratio['high']:.3g}]",
+        "the paper": "" if ratio["published"] is None else f"{ratio['published']:.2g}",
+        "shown": "**smaller**" if ratio["high"] < 1.0 else "**larger**" if ratio["low"] > 1.0 else "not shown",
+    }
 
 
 def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
     document.text("## Appendix", "### A: opponents of every top speed learn")
     if plan.opponents:
-        curves = {
-            f"{unit.max_speed_mps:g} m/s": [figures.read_learning(unit.run_folder(work))] for unit in plan.opponents
-        }
         document.text(_verification(plan.opponents, work))
-        document.figure("appendix-a", figures.draw_learning(curves, "Appendix A: PPO for every top speed"))
+        curves = {f"{unit.max_speed_mps:g} m/s": [unit.run_folder(work)] for unit in plan.opponents}
+        _write_learning(document, "a", curves, "Appendix A: PPO for every top speed")
     else:
         document.text("Not in this budget: the opponents are those that come with outlap.")
     for letter, (key, title) in zip("BCEF", APPENDIX_TITLES.items(), strict=True):
         units = plan.curves.get(key, ())
         if not units:
             continue
-        curves = {title: [figures.read_learning(unit.folder(work)) for unit in units]}
         document.text(f"### {letter}: {title.partition(': ')[2]}; {plan.circuits[key[0]].title}")
-        document.figure(f"appendix-{letter.lower()}", figures.draw_learning(curves, title))
+        _write_learning(document, letter.lower(), {title: [unit.folder(work) for unit in units]}, title)
         if letter == "C":
             document.text("### D: β and ABC's β during adaptation")
             histograms, updates = _read_clipping(plan, work, "histograms"), _read_clipping(plan, work, "updates")
@@ -284,51 +257,47 @@ def _write_appendix(document: Document, plan: Plan, work: Path) -> None:
             document.figure("appendix-d", figures.draw_weights(histograms, updates, title))
 
 
+def _write_learning(document: Document, letter: str, folders: Mapping[str, Sequence[Path]], title: str) -> None:
+    curves = {label: [figures.read_learning(each) for each in runs] for label, runs in folders.items()}
+    document.figure(f"appendix-{letter}", figures.draw_learning(curves, title))
+
+
 def _verification(opponents: Sequence[OpponentUnit], work: Path) -> str:
-    """Which opponents completed their laps."""
-    failed = []
-    for unit in opponents:
-        laps = pd.read_parquet(unit.folder(work) / ROWS)["completed_laps"].to_numpy()
-        if (laps < unit.laps).any():
-            failed.append(unit.name)
+    """Return which opponents completed their laps."""
     first = opponents[0]
+    failed = [
+        unit.name
+        for unit in opponents
+        if pd.read_parquet(unit.folder(work) / ROWS)["completed_laps"].to_numpy().min() < unit.laps
+    ]
     passed = f"{len(opponents) - len(failed)} of {len(opponents)} opponents completed {first.laps} laps"
     left_out = f"; left out of all races: {', '.join(failed)}" if failed else ""
     return f"{passed} from each of {first.starts} standing starts, alone on {first.track}{left_out}."
 
 
-def _write_effort(document: Document, results: Sequence[TableResult], titles: Mapping[str, str], work: Path) -> None:
-    """What each method was trained with, and what it saw of the tasks that it is tested on."""
-    document.text("## What went into every method")
-    rows = []
-    for method in next(iter(results)).cells:
-        races = [race for result in results for race in result.plan.races if race.method == method]
-        trainings = {race.training.key: race.training for race in races if race.training}
-        actions = sorted({unit.config.total_steps for unit in trainings.values()})
-        minutes = [float(done_record(unit, work)["seconds"]) / 60.0 for unit in trainings.values()]
-        adapts = next((race.adaptation for race in races if race.adaptation is not None), None)
-        settings = adaptation_settings(adapts) if adapts is not None else None
-        seen = settings.iterations * settings.collect_steps * COLLECTING_WORLDS if settings else 0
-        rows.append(
-            [
-                titles[method],
-                ", ".join(f"{number:,}" for number in actions) or "none",
-                f"{sum(minutes) / len(minutes):.1f}" if minutes else "0",
-                f"{seen:,}" if seen else "none",
-            ]
-        )
-    document.table(
-        ["method", "actions of a training", "core minutes of one, mean", "actions on each test task before the races"],
-        rows,
-    )
+def _effort(method: str, title: str, races: Sequence[RaceUnit], work: Path) -> dict[str, str]:
+    """Return what a method was trained with, and what it saw of the tasks that it is tested on."""
+    mine = [race for race in races if race.method == method]
+    trainings = {race.training.key: race.training for race in mine if race.training}.values()
+    actions = sorted({unit.config.total_steps for unit in trainings})
+    minutes = [float(done_record(unit, work)["seconds"]) / 60.0 for unit in trainings]
+    adapts = next((race.adaptation for race in mine if race.adaptation is not None), None)
+    settings = adaptation_settings(adapts) if adapts is not None else None
+    seen = settings.iterations * settings.collect_steps * COLLECTING_WORLDS if settings else 0
+    return {
+        "method": title,
+        "actions of a training": ", ".join(f"{number:,}" for number in actions) or "none",
+        "core minutes of one, mean": f"{sum(minutes) / len(minutes):.1f}" if minutes else "0",
+        "actions on each test task before the races": f"{seen:,}" if seen else "none",
+    }
 
 
 def _core_seconds(plan: Plan, work: Path) -> dict[str, float]:
-    """What the units took, by kind."""
-    seconds: dict[str, float] = {}
+    """Return what the units took, by kind."""
+    seconds: Counter[str] = Counter()
     for unit in plan.units:
-        seconds[unit.kind] = seconds.get(unit.kind, 0.0) + float(done_record(unit, work)["seconds"])
-    return seconds
+        seconds[unit.kind] += done_record(unit, work)["seconds"]
+    return dict(seconds)
 
 
 def _write_record(document: Document, plan: Plan, record: Mapping[str, Any]) -> None:
@@ -340,12 +309,10 @@ def _write_record(document: Document, plan: Plan, record: Mapping[str, Any]) -> 
         f"```sh\n{record['command']}\n```",
         f"{machine['processor']}, {machine['cores']} cores, {machine['system']}; {versions}.",
     )
+    counts = Counter(unit.kind for unit in plan.units)
     document.table(
-        ["work", "units", "core minutes"],
-        [
-            [kind, str(sum(unit.kind == kind for unit in plan.units)), f"{seconds / 60.0:.0f}"]
-            for kind, seconds in record["core_seconds"].items()
-        ],
+        {"work": kind, "units": str(counts[kind]), "core minutes": f"{seconds / 60.0:.0f}"}
+        for kind, seconds in record["core_seconds"].items()
     )
     methods = {name: method.model_dump(mode="json", exclude_defaults=True) for name, method in plan.methods.items()}
     settings = {"budget": plan.budget.model_dump(mode="json", exclude_defaults=True), "methods": methods}
