@@ -20,7 +20,7 @@ def straight_on(observation) -> np.ndarray:
     return np.tile(np.array([0.0, 1.0]), (len(observation["frenet"]), 1))
 
 
-straight_on.observation_terms = ("frenet",)
+straight_on.observation_terms = ("frenet",)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def stands(observation) -> np.ndarray:
@@ -28,7 +28,7 @@ def stands(observation) -> np.ndarray:
     return np.tile(np.array([0.0, -1.0]), (len(observation["frenet"]), 1))
 
 
-stands.observation_terms = ("frenet",)
+stands.observation_terms = ("frenet",)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def race(track, driver, num_cars: int = 2, beams: int = 0, **config) -> RaceVectorEnv:

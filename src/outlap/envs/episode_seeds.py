@@ -32,7 +32,8 @@ class EpisodeSeeds:
         """
         count = len(self._keys)
         if isinstance(seed, (int, np.integer)):
-            seeds: list[Any] = [int(seed) + i for i in range(count)]
+            first = int(cast("int", seed))
+            seeds: list[Any] = [first + i for i in range(count)]
         else:
             seeds = [*cast("Sequence[Any]", seed)] if isinstance(seed, (Sequence, np.ndarray)) else [seed]
         for each in seeds:

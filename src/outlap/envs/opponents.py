@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from typing import cast
 
 import numpy as np
 
@@ -112,15 +113,15 @@ class Opponents:
         return np.clip(out, -1.0, 1.0)
 
     def _observe(self, driver: Driver) -> dict[str, np.ndarray]:
-        """What a driver would be told in every car: (worlds, cars - 1, size) of its terms.
+        """Return the observation of a driver in every car: (worlds, cars - 1, size) of its terms.
 
-        A driver that looks with fewer beams than the cars have gets the nearest ones.
+        A driver with fewer beams than the cars have gets the nearest ones.
         """
         terms, scaled = driver.observation_terms, driver.scale_observations
         seen = [observe(self.race, car, terms, scaled) for car in range(1, self.number.shape[1] + 1)]
         observation = {name: np.stack([each[name] for each in seen], axis=1) for name in seen[0]}
         if "scan" in observation and driver.beams is not None and driver.beams != observation["scan"].shape[2]:
-            evenly: np.ndarray = np.linspace(0, observation["scan"].shape[2] - 1, driver.beams)
+            evenly = cast("np.ndarray", np.linspace(0, observation["scan"].shape[2] - 1, driver.beams))  # pyright: ignore[reportUnknownMemberType]
             chosen = np.rint(evenly).astype(np.int64)
             observation["scan"] = observation["scan"][..., chosen]
         return observation

@@ -173,7 +173,7 @@ class MQL(OffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: str | os.PathLike[str], truncate_last_traj: bool = True) -> None:  # type: ignore[override]
         """Take up a replay that `save_replay_buffer` wrote, of any number of worlds; see `ReplayBuffer.load`."""
-        self.replay_buffer = ReplayBuffer.load(path)
+        self.replay_buffer = ReplayBuffer.load(path)  # pyright: ignore[reportIncompatibleVariableOverride]
         self.replay_buffer.forget_worlds(self.n_envs)
         self._last_obs = None  # so that `learn` begins new episodes
 
