@@ -128,7 +128,9 @@ def test_a_run_of_a_gpu_is_adapted_on_the_cpu_where_there_is_none(run: Path, cap
     words = ["adapt", "run", "--tracks", "ring6", "--seeds", "1", "--clip", "none", *SHORT, "--time-limit", "1"]
     capfd.readouterr()
     assert main([*words, "--quiet"]) == 0
-    assert capfd.readouterr()[1] == "run: was trained on device cuda:99, which is not there; it goes on on the CPU\n"
+    assert (
+        capfd.readouterr()[1] == "run: was trained on device cuda:99, which is not available; continuing on the CPU\n"
+    )
 
 
 def test_a_folder_of_somebody_else_is_left_as_it_is(run: Path, capfd: pytest.CaptureFixture[str]) -> None:

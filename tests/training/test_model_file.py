@@ -155,7 +155,7 @@ def test_a_training_whose_checkpoints_do_not_fit_does_not_begin_anew() -> None:
     begun = load_run("run")
     kept = begun.checkpoints()
     other = Run(begun.folder, PPOConfig.model_validate({**PPO, "env": {**PPO["env"], "beams": 9}}))
-    with pytest.raises(OutlapError, match="nor can those before; remove run/checkpoints to begin anew"):
+    with pytest.raises(OutlapError, match="nor can those before; remove run/checkpoints to start over"):
         train(other.config, other.folder, resume=other)
     assert begun.checkpoints() == kept
     assert np.isfinite(train(config, begun.folder, resume=begun).record()["seconds"])

@@ -97,7 +97,7 @@ def test_a_network_that_diverges_ends_the_training_and_spares_what_was_saved() -
     stopped_after(256, SMALL, Path("run"))
     run = load_run("run")
     kept = run.checkpoints()
-    said = f"diverged: .* is NaN or beyond 1e\\+08 after .* checkpoint is {kept[0]}; train anew"
+    said = f"diverged: .* is NaN or beyond 1e\\+08 after .* checkpoint is {kept[0]}; train again"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stable_baselines3.ppo.PPO.load", _loaded_with(1e30))
         with pytest.raises(OutlapError, match=said):

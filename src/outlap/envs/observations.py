@@ -1,4 +1,4 @@
-"""Observation terms: what a car can be told, each a function of the race and the car.
+"""Observation terms, each a function of the race and the car.
 
 The first four are the paper's. Each term declares the constant that brings its usual values to about one;
 `RaceConfig.scale_observations` divides by it.
@@ -107,7 +107,7 @@ def nearby_cars(race: Race, car: int) -> np.ndarray:
     dx, dy = state[..., column.X] - own[..., column.X], state[..., column.Y] - own[..., column.Y]
     cos, sin = np.cos(own[..., column.YAW]), np.sin(own[..., column.YAW])
     turn = state[..., column.YAW] - own[..., column.YAW]
-    told = np.stack(
+    relative = np.stack(
         [
             np.ones_like(dx), cos * dx + sin * dy, cos * dy - sin * dx, np.arctan2(np.sin(turn), np.cos(turn)),
             state[..., column.SPEED] - own[..., column.SPEED],
@@ -118,8 +118,8 @@ def nearby_cars(race: Race, car: int) -> np.ndarray:
     away[:, car] = np.inf
     nearest = np.argsort(away, axis=1, kind="stable")[:, : min(race.nearby_cars, state.shape[1] - 1)]
     there = np.isfinite(np.take_along_axis(away, nearest, axis=1))
-    out = np.zeros((len(state), race.nearby_cars, told.shape[-1]), np.float32)
-    out[:, : nearest.shape[1]] = np.take_along_axis(told, nearest[..., None], axis=1) * there[..., None]
+    out = np.zeros((len(state), race.nearby_cars, relative.shape[-1]), np.float32)
+    out[:, : nearest.shape[1]] = np.take_along_axis(relative, nearest[..., None], axis=1) * there[..., None]
     return out.reshape(len(state), -1)
 
 

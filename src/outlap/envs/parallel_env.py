@@ -59,7 +59,7 @@ class RaceParallelEnv(ParallelEnv[str, dict[str, np.ndarray], np.ndarray]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, dict[str, Any]]]:
-        """Begin a race; a seed starts the stream of races anew."""
+        """Begin a race; a seed restarts the stream of races."""
         self._env.reset(seed=seed)
         self.agents = list(self.possible_agents)
         return self._observe(), {agent: self._info(agent) for agent in self.agents}

@@ -17,7 +17,7 @@ from outlap.simulator.simulator import Simulator
 from outlap.simulator.worlds import ARC_LENGTH, Worlds
 
 EGO = 0
-RUNNING = ""  # the outcome of a race that goes on
+RUNNING = ""  # the outcome of a race that continues
 
 
 @dataclass

@@ -79,7 +79,7 @@ class RaceEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode; a seed starts the stream of episodes anew."""
+        """Begin an episode; a seed restarts the stream of episodes."""
         super().reset(seed=seed)
         observation, info = self._env.reset(seed=seed)
         self._show(begins=True)

@@ -179,7 +179,7 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
             self.reward_terms[car] = terms
 
     def observe(self, car: int) -> dict[str, np.ndarray]:
-        """What a car is told: (worlds, size) of every term, float32."""
+        """Return the observation of a car: (worlds, size) of every term, float32."""
         return observe(self.race, car, self.config.observation, self.config.scale_observations)
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -1,4 +1,4 @@
-"""What is drawn anew in every episode: the track and the parameters of every car in it."""
+"""Tasks: the track and the parameters of every car, drawn at each reset."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ def _places(count: int) -> str:
 
 
 def how_it_ended(info: Mapping[str, Any]) -> str:
-    """How an episode of the only world ended, in words, from what its last step told."""
+    """Return in words how the episode of the only world ended, from the information of its last step."""
     outcome = str(info["outcome"][0])
     if outcome == CRASH:
         return f"{outcome} into a {info['contact'][0]} at {info['impact_speed_mps'][0]:.1f} m/s"

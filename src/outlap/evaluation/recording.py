@@ -1,4 +1,4 @@
-"""Recording episodes to be looked at again, and laps for a ghost to drive again."""
+"""A recorded episode: its frames, events and file format."""
 
 from __future__ import annotations
 

@@ -307,7 +307,7 @@ def run_with_store(unit: Unit, scratch: Path, store: Store, report: Report) -> f
         try:
             store.put_part(unit, scratch)
         except Exception as error:  # each file system has errors of its own; the next copy may succeed
-            log.warning("%s: goes on, and is not copied to %s: %s", unit.name, store.url, error)
+            log.warning("%s: continues, but is not copied to %s: %s", unit.name, store.url, error)
         copied = time.monotonic()
 
     for needed in {each.key: each for each in unit.all_needs()}.values():

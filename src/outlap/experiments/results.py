@@ -135,7 +135,7 @@ def read_rows(plan: Plan, work: Path) -> pd.DataFrame:
 
 
 def metrics_of(num_cars: int) -> tuple[str, ...]:
-    """Return the names of the metrics of races with so many cars."""
+    """Return the names of the metrics of races with `num_cars` cars."""
     return tuple(name for name in METRICS if num_cars > 1 or name not in RACING)
 
 

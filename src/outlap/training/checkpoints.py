@@ -72,10 +72,10 @@ def newest_model(run: Run, environment: SB3VecEnv, config: TrainingConfig) -> Ba
             try:
                 model.load_replay_buffer(replay)  # type: ignore[attr-defined]
             except OutlapError as error:
-                log.warning("%s; the training goes on with an empty one", error)
+                log.warning("%s; the training continues with an empty one", error)
         return model
     if error is not None:
-        raise OutlapError(f"{error}; nor can those before; remove {run.folder}/checkpoints to begin anew") from error
+        raise OutlapError(f"{error}; nor can those before; remove {run.folder}/checkpoints to start over") from error
     return None
 
 
@@ -87,7 +87,7 @@ def check_finite(model: Any, run: Run) -> None:
             last = f"the last good checkpoint is {kept[0]}" if kept else "there is no checkpoint yet"
             raise TrainingDiverged(
                 f"{run.folder}: the training diverged: {name} is NaN or beyond {LARGEST_WEIGHT:g} after "
-                f"{model.num_timesteps:,} steps; {last}; train anew with a lower --learning-rate"
+                f"{model.num_timesteps:,} steps; {last}; train again with a lower --learning-rate"
             )
 
 

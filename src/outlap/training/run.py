@@ -179,7 +179,7 @@ def load_meta(run: Run) -> MQL:
     try:
         check_device(device)
     except OutlapError:
-        log.warning("%s: was trained on device %s, which is not there; it goes on on the CPU", run.folder, device)
+        log.warning("%s: was trained on device %s, which is not available; continuing on the CPU", run.folder, device)
         device = "cpu"
     meta: Any = load_model(run.config, run.policy_path, device=device)
     meta.load_replay_buffer(run.replay_path)
