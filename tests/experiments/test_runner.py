@@ -172,3 +172,10 @@ def test_units_that_follow_from_finished_ones_are_done_too(tmp_path: Path):
     run_units([first, second], tmp_path, LocalEngine(2), on_done=on_done)  # finished ones are reported again
     assert finished == ["first", "second", "last"]
     assert [len(begun(unit, tmp_path)) for unit in (first, second, last)] == [1, 1, 1]
+
+
+def test_another_version_does_not_reuse_units(monkeypatch: pytest.MonkeyPatch):
+    before, same = Fake("unit").key, Fake("unit").key
+    assert before == same
+    monkeypatch.setattr("outlap.experiments.unit._version", lambda package: f"{package} of tomorrow")
+    assert Fake("unit").key != before

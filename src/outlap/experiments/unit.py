@@ -1,7 +1,7 @@
 """A unit of work: a folder, written once and reused by everything that needs it.
 
-A hash of the unit's fields, including the units that it needs, names the folder. A changed field therefore gets a new
-folder, and everything else is reused. A unit is done when its `done.json` exists.
+A hash of the unit's fields, including the units that it needs, and of outlap's version names the folder. A changed
+field therefore gets a new folder, and everything else is reused. A unit is done when its `done.json` exists.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,12 +26,13 @@ Report = Callable[[float], None]  # takes the finished share of a unit, 0 … 1;
 class Unit:
     """A piece of work.
 
-    The fields identify it. Fields that hold units are its requirements; a field with `compare=False`, such as the
-    place of an input on this machine, does not enter the hash.
+    The fields and the versions of its packages identify it. Fields that hold units are its requirements; a field with
+    `compare=False`, such as the place of an input on this machine, does not enter the hash.
     """
 
     name: str
     kind: ClassVar[str]
+    packages: ClassVar[tuple[str, ...]] = ("outlap",)  # results of other versions of these are not reused
 
     @cached_property
     def needs(self) -> tuple[Unit, ...]:
@@ -51,6 +53,7 @@ class Unit:
     def key(self) -> str:
         """The hash that identifies the unit, 12 hexadecimal digits."""
         content: dict[str, Any] = {"version": VERSION, "kind": self.kind, "needs": [unit.key for unit in self.needs]}
+        content["versions"] = {package: _version(package) for package in self.packages}
         for each in fields(self):
             value = getattr(self, each.name)
             needed = isinstance(value, Unit) or (isinstance(value, tuple) and any(isinstance(v, Unit) for v in value))
@@ -89,6 +92,9 @@ class Unit:
     def do(self, work: Path, report: Report) -> None:
         """Do the work in its folder, or resume it. Raise KeyboardInterrupt if `report` does, with the work saved."""
         raise NotImplementedError
+
+
+_version = cache(version)  # reads a file
 
 
 def done_record(unit: Unit, work: Path) -> dict[str, Any]:
