@@ -106,6 +106,10 @@ def test_an_adaptation_goes_on_where_it_was_interrupted(
     assert {path.name for path in folder.rglob("*")} == {path.name for path in Path("whole").rglob("*")}
     assert main([*words, "--out", str(folder), "--seeds", "3"]) == 0
     assert raced[6:] == ["none", "abc"]  # only what is new
+    assert main([*words, "--out", str(folder), "--clip", "fixed", "none"]) == 0
+    assert raced[8:] == ["fixed", "fixed"]  # the order of the rules does not matter
+    kept = sorted(path.stem for path in (folder / "recordings").iterdir())
+    assert kept == ["ring6-000-0-before", "ring6-000-1-fixed", "ring6-000-2-none"]
 
 
 @pytest.mark.usefixtures("one_process")

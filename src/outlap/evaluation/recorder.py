@@ -32,7 +32,6 @@ def record_episodes(
     number: int,
     folder: Path,
     title: str | None = None,
-    suffix: str = "",
     on_recorded: Callable[[Path], None] | None = None,
 ) -> None:
     """Race the first episodes that `evaluate` races on a track with this seed again, and record each in a folder.
@@ -41,12 +40,12 @@ def record_episodes(
         driver, env, track, title: see `record_episode`.
         seed: of the evaluation.
         number: of episodes.
-        folder: of the files TRACK-EPISODE.npz; `suffix` comes before the ending.
+        folder: of the files TRACK-EPISODE.npz.
         on_recorded: called with the path of each file.
     """
     for episode, own in enumerate(episode_seeds(seed, track.name, number).tolist()):
         recording = record_episode(driver, env, track, own, title)
-        path = recording.save(folder / f"{track.name.replace('/', '-')}-{episode:03d}{suffix}{SUFFIX}")
+        path = recording.save(folder / f"{track.name.replace('/', '-')}-{episode:03d}{SUFFIX}")
         if on_recorded is not None:
             on_recorded(path)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -17,10 +18,11 @@ from outlap.envs.race_config import RaceConfig
 from outlap.evaluation import protocol, rollout
 from outlap.evaluation.metrics import summarise_methods
 from outlap.evaluation.recorder import record_episodes
-from outlap.evaluation.recording import RECORDINGS
+from outlap.evaluation.recording import RECORDINGS, SUFFIX
 from outlap.evaluation.results import ROWS, UPDATES, prepare_folder, save_results, write_rows
 from outlap.experiments.paper_units import adaptation_settings, collecting_env
 from outlap.experiments.unit import Report, Unit
+from outlap.files import make_folder
 from outlap.provenance import provenance
 from outlap.track.catalog import load_track
 from outlap.training.run import Run, load_meta, load_run
@@ -47,6 +49,7 @@ class AdaptationUnit(Unit):
     """A policy adapted to a track, unless it is the one before, and its races there: a row an episode."""
 
     kind = "adaptations"
+    packages = ("outlap", "torch", "stable-baselines3")
     run_folder: Path = field(compare=False)
     device: str = field(compare=False)
     policy: str  # SHA-256 of its file
@@ -57,7 +60,6 @@ class AdaptationUnit(Unit):
     settings: Mapping[str, Any]  # what differs from the defaults of an adaptation
     worlds: int  # that collect
     races: Races
-    suffix: str  # of the names of recordings
 
     @property
     def tracks(self) -> tuple[str, ...]:
@@ -87,9 +89,8 @@ class AdaptationUnit(Unit):
             on_progress=lambda now: report(0.5 + 0.5 * now.done / now.total),
         )  # fmt: skip
         if self.races.recorded:
-            record_episodes(
-                driver, env, track, self.races.seed, self.races.recorded, folder / RECORDINGS, self.method, self.suffix
-            )
+            recordings = folder / RECORDINGS
+            record_episodes(driver, env, track, self.races.seed, self.races.recorded, recordings, self.method)
         write_rows(rows.assign(method=self.method, adaptation_seed=self.seed), folder / ROWS)
 
     def _policy(self, folder: Path, report: Report) -> MQL | MQLPolicy:
@@ -146,7 +147,7 @@ def adaptation_units(
     units = []
     for name in tracks:
         label = re.sub(r"[^\w.-]+", "-", load_track(name).name)
-        for number, (method, seed) in enumerate(methods):
+        for method, seed in methods:
             changes = {} if method == BEFORE else {**settings, "clip": method}
             adaptation_settings(changes)
             units.append(
@@ -162,7 +163,6 @@ def adaptation_units(
                     settings=changes,
                     worlds=worlds,
                     races=races if seed in (NO_SEED, seeds[0]) else replace(races, recorded=0),
-                    suffix=f"-{number}-{method}",
                 )
             )
     return units
@@ -189,9 +189,18 @@ def write_adaptations(
     rows = pd.concat([pd.read_parquet(each / ROWS) for each in folders], ignore_index=True)
     updates = [pd.read_parquet(each / UPDATES) for each in folders if (each / UPDATES).is_file()]
     write_rows(pd.concat(updates, ignore_index=True), folder / UPDATES)
-    for each in folders:
-        if (each / RECORDINGS).is_dir():
-            shutil.copytree(each / RECORDINGS, folder / RECORDINGS, dirs_exist_ok=True)
+    _copy_recordings(units, folder)
     summary = summarise_methods(rows)
     save_results(folder, rows, summary, {**provenance(), "settings": settings, "tracks": fingerprints})
     return summary
+
+
+def _copy_recordings(units: Sequence[AdaptationUnit], folder: Path) -> None:
+    """Copy the recordings of units in place of those of an earlier run, named in the order of each track's units."""
+    shutil.rmtree(folder / RECORDINGS, ignore_errors=True)
+    numbers: Counter[str] = Counter()
+    for unit in units:
+        for path in sorted((unit.folder(folder / "work") / RECORDINGS).glob(f"*{SUFFIX}")):
+            name = f"{path.stem}-{numbers[unit.track]}-{unit.method}{SUFFIX}"
+            shutil.copyfile(path, make_folder(folder / RECORDINGS) / name)
+        numbers[unit.track] += 1
