@@ -179,7 +179,7 @@ def planned(monkeypatch: pytest.MonkeyPatch) -> list[OpponentUnit]:
     """Units that `opponents train` would do."""
     planned: list[OpponentUnit] = []
 
-    def note(units: Sequence[OpponentUnit], work: Path, engine: Engine, on_status: Any, on_done: Any) -> None:
+    def note(units: Sequence[OpponentUnit], work: Path, engine: Engine, *callbacks: Any) -> None:
         planned.extend(units)
 
     def enter(units: Sequence[OpponentUnit], work: Path, folder: Path, command: str) -> list[tuple]:

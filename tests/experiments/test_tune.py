@@ -17,11 +17,12 @@ from outlap.cli.main import main
 from outlap.config import load_config
 from outlap.errors import OutlapError
 from outlap.evaluation.results import ROWS, write_rows
+from outlap.experiments.engine import LocalEngine
 from outlap.experiments.paper_units import RaceUnit
 from outlap.experiments.runner import run_units
 from outlap.experiments.search import SearchConfig
 from outlap.experiments.tune import RungUnit, Tuner
-from outlap.experiments.unit import Unit
+from outlap.experiments.unit import Report, Unit
 from outlap.training.checkpoints import TrainingDiverged
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
@@ -145,6 +146,49 @@ def test_values_are_drawn_near_the_best(tmp_path: Path):
     assert len(found) == 40
     later = found.loc[found["trial"] >= 20, "gamma"].to_numpy(np.float64)
     assert np.abs(later - 0.8).mean() < 0.06  # 0.13 at random
+
+
+def test_values_that_are_drawn_again_are_judged_without_work(tmp_path: Path):
+    tuner = Tuner(search(sampler="tpe", trials=4, rungs=[0.5]), tmp_path)
+    racer = Racer(tuner, lambda gamma, _: [gamma, gamma])
+    found = racer.run()
+    assert len(found) == 4
+    assert not any(trial.is_open for trial in tuner.trials)
+    assert len(set(racer.raced)) == len(racer.raced) <= 4
+
+
+def test_a_training_that_fails_makes_room_for_the_next_trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail_twice(unit: RungUnit, work: Path, report: Report) -> None:
+        if len(failed) < 2:
+            failed.append(unit.config.gamma)
+            raise ValueError("no luck")
+
+    def race(unit: RaceUnit, work: Path, report: Report) -> None:
+        rows = pd.DataFrame({"progress_m": [1.0], "outcome": ["timeout"], "mean_speed_mps": [1.0]})
+        write_rows(rows, unit.folder(work) / ROWS)
+
+    failed: list[float] = []
+    monkeypatch.setattr("outlap.experiments.workers.ProcessPoolExecutor", OneProcess)
+    monkeypatch.setattr(RungUnit, "do", fail_twice)
+    monkeypatch.setattr(RaceUnit, "do", race)
+    varied = {"gamma": {"uniform": [0.9, 0.99]}}
+    config = search(search=varied, sampler="tpe", trials=4)
+    tuner = Tuner(config, tmp_path)
+    with pytest.raises(OutlapError, match="2 of 6 units of work failed"):
+        run_units(tuner.first_units(), tuner.work, LocalEngine(1), on_done=tuner.on_done, on_failed=tuner.on_failed)
+    assert [trial.values["gamma"] for trial in tuner.trials[:2]] == failed
+    again = Tuner(config, tmp_path)
+    assert [trial.is_open for trial in again.trials] == [True, True, False, False]
+    run_units(again.first_units(), again.work, LocalEngine(1), on_done=again.on_done, on_failed=again.on_failed)
+    assert np.isfinite(again.results()["progress_m"]).all()
+    assert len(again.results()) == 4
+
+
+def test_values_that_are_drawn_again_after_a_failure_fail_too(tmp_path: Path):
+    tuner = Tuner(search(search={"gamma": [0.9]}, sampler="tpe", trials=3), tmp_path)
+    (unit,) = tuner.first_units()
+    assert tuner.on_failed(unit) == []
+    assert [trial.is_open for trial in tuner.trials] == [False] * 3
 
 
 def test_a_changed_file_keeps_the_units_of_the_trials_that_it_still_has(tmp_path: Path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,8 +40,9 @@ class Tune(WorkCommand):
         self.check_flags()
         folder = self.out or Path("runs") / f"tune-{self.file.stem}"
         config = load_config(SearchConfig, self.file)
-        tuner = Tuner(config, folder, parallel=self.jobs or os.cpu_count() or 1)
-        self.do_units(tuner.first_units(), tuner.work, "tuning", tuner.on_done, config.tracks)
+        parallel = self.count_slots() if config.sampler == "tpe" else 1  # which alone depends on it
+        tuner = Tuner(config, folder, parallel)
+        self.do_units(tuner.first_units(), tuner.work, "tuning", tuner.on_done, tuner.on_failed, config.tracks)
         found = tuner.results()
         write_rows(found, folder / "trials.parquet")
         best = tuner.trials[int(found["trial"].iloc[0])].rungs[-1][0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from outlap.files import make_folder
 
 if TYPE_CHECKING:
     from outlap.experiments.engine import Engine
-    from outlap.experiments.runner import OnDone, Status
+    from outlap.experiments.runner import Follow, Status
     from outlap.experiments.unit import Unit
 
 
@@ -49,14 +50,15 @@ class WorkCommand(LongCommand):
         units: Sequence[Unit],
         work: Path,
         title: str,
-        on_done: OnDone | None = None,
+        on_done: Follow | None = None,
+        on_failed: Follow | None = None,
         tracks: Iterable[str] = (),
         resume: str = "go on with the same command",
     ) -> None:
         """Do units with a progress bar, see `run_units`; after Ctrl-C say how to resume.
 
         Args:
-            units: see `run_units`, as `work` and `on_done`.
+            units: see `run_units`, as `work`, `on_done` and `on_failed`.
             title: of the progress bar.
             tracks: names of tracks that only units use which follow from others.
             resume: how, in words.
@@ -69,11 +71,24 @@ class WorkCommand(LongCommand):
         with self.progress(title, 1000, "‰") as update:
             try:
                 run_units(
-                    units, work, engine, lambda status: update(round(1000 * status.share), _note(status)), on_done
+                    units,
+                    work,
+                    engine,
+                    lambda status: update(round(1000 * status.share), _note(status)),
+                    on_done,
+                    on_failed,
                 )
             except KeyboardInterrupt:
                 print(f"\nsaved; {resume}", file=sys.stderr)
                 raise
+
+    def count_slots(self) -> int:
+        """Return how many units are done at a time."""
+        if self.jobs or self.engine == "local":
+            return self.jobs or os.cpu_count() or 1
+        from outlap.experiments.ray_engine import cluster_cores
+
+        return cluster_cores(self.address)
 
     def _make_engine(self, tracks: Mapping[str, str]) -> Engine:
         """Return the engine; on other machines tracks must have these fingerprints."""

@@ -64,6 +64,12 @@ def ray_cluster(address: str | None) -> Iterator[None]:
         ray.shutdown()
 
 
+def cluster_cores(address: str | None) -> int:
+    """Return the number of cores of a Ray cluster, see `ray_cluster`."""
+    with ray_cluster(address):
+        return max(1, int(import_ray().cluster_resources().get("CPU", 1)))
+
+
 class RayEngine:
     """A Ray cluster.
 
@@ -98,7 +104,7 @@ class RayEngine:
 
     @property
     def slots(self) -> int:
-        cores = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+        cores = cluster_cores(self._address)
         return min(self._jobs or cores, cores)
 
     def open(self, work: Path) -> None:

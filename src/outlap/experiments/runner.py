@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 POLL_INTERVAL = 0.5  # [s] between two status reports
 
-OnDone = Callable[[Unit], Sequence[Unit]]
+Follow = Callable[[Unit], Sequence[Unit]]  # returns units to do next
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ def run_units(
     work: Path,
     engine: Engine | None = None,
     on_status: Callable[[Status], None] | None = None,
-    on_done: OnDone | None = None,
+    on_done: Follow | None = None,
+    on_failed: Follow | None = None,
 ) -> None:
     """Do all units that are not done yet.
 
@@ -51,6 +52,7 @@ def run_units(
         engine: what does them, by default one unit on each core of this machine. It is closed at the end.
         on_status: called repeatedly.
         on_done: called once with each finished unit, earlier sessions included; returns units to do next.
+        on_failed: called once with each unit that fails, or needs one that failed; returns units to do next.
 
     Raises OutlapError that names the units that failed, after all others are done. A KeyboardInterrupt passes through
     after every running unit has saved its work.
@@ -58,7 +60,7 @@ def run_units(
     work.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(work / ".lock", timeout=0):
-            _Session(work, engine or LocalEngine(), on_done).run(units, on_status)
+            _Session(work, engine or LocalEngine(), on_done, on_failed).run(units, on_status)
     except Timeout:
         raise OutlapError(f"{work}: another process is at work there; wait for it, or give another --out") from None
 
@@ -66,8 +68,8 @@ def run_units(
 class _Session:
     """One call of `run_units`."""
 
-    def __init__(self, work: Path, engine: Engine, on_done: OnDone | None) -> None:
-        self._work, self._engine, self._on_done = work, engine, on_done
+    def __init__(self, work: Path, engine: Engine, on_done: Follow | None, on_failed: Follow | None) -> None:
+        self._work, self._engine, self._on_done, self._on_failed = work, engine, on_done, on_failed
         self._units: dict[str, Unit] = {}  # all of them, by key, as below
         self._done: set[str] = set()
         self._waiting: list[Unit] = []
@@ -92,7 +94,7 @@ class _Session:
                         self._finish(unit)
                     else:
                         log.warning("%s failed: %s", unit.name, outcome.error)
-                        self._failed[unit.key] = f"{type(outcome.error).__name__}: {outcome.error}"
+                        self._fail(unit, f"{type(outcome.error).__name__}: {outcome.error}")
                 if on_status is not None:
                     on_status(self._status())
         finally:
@@ -101,8 +103,7 @@ class _Session:
             key, reason = next(iter(self._failed.items()))
             raise OutlapError(
                 f"{len(self._failed)} of {len(self._units)} units of work failed, {self._units[key].name} first "
-                f"({reason}); what is done is kept: the same command tries again, and other --methods or tables go "
-                "without it"
+                f"({reason}); what is done is kept: the same command tries again"
             )
 
     def _add(self, units: Sequence[Unit]) -> None:
@@ -119,6 +120,11 @@ class _Session:
         if self._on_done is not None:
             self._add(self._on_done(unit))
 
+    def _fail(self, unit: Unit, reason: str) -> None:
+        self._failed[unit.key] = reason
+        if self._on_failed is not None:
+            self._add(self._on_failed(unit))
+
     def _submit(self) -> None:
         """Submit units that can begin."""
         for unit in list(self._waiting):
@@ -126,7 +132,7 @@ class _Session:
                 break
             if any(needed.key in self._failed for needed in unit.needs):
                 self._waiting.remove(unit)
-                self._failed[unit.key] = "needs one that failed"
+                self._fail(unit, "needs one that failed")
             elif all(needed.key in self._done for needed in unit.needs):
                 self._waiting.remove(unit)
                 self._running[unit.key] = unit

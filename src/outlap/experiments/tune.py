@@ -129,6 +129,7 @@ class Tuner:
         self._total = config.trials or len(self._combinations or ())
         self._study = _open_study(config, make_folder(folder))
         self._finished: set[str] = set()  # keys
+        self._failed: set[str] = set()  # likewise, in this session
         drawn = [known for known in self._study.trials if known.state.name != "WAITING"]
         self.trials = [self._trial(self._live(known.number)) for known in drawn]
         for trial, known in zip(self.trials, drawn, strict=True):
@@ -145,6 +146,18 @@ class Tuner:
     def on_done(self, unit: Unit) -> list[Unit]:
         """Return the units that follow from a finished one, see `run_units`."""
         self._finished.add(unit.key)
+        return self._follow(unit)
+
+    def on_failed(self, unit: Unit) -> list[Unit]:
+        """Close the trials of a unit that failed, and return the units to do in their place, see `run_units`.
+
+        Optuna keeps these trials as running, so that the next session of the search tries them again.
+        """
+        self._failed.add(unit.key)
+        return self._follow(unit)
+
+    def _follow(self, unit: Unit) -> list[Unit]:
+        """Advance the trials of a unit that has ended; return the units to do next."""
         found: list[Unit] = []
         for trial in list(self.trials):
             present = (*trial.rungs[trial.rung], *trial.races[trial.rung])
@@ -179,7 +192,7 @@ class Tuner:
             if self._combinations is not None and len(self._study.trials) == len(self.trials):
                 self._study.enqueue_trial(self._combinations[len(self.trials)])
             self.trials.append(self._trial(self._study.ask()))
-            units += self.trials[-1].rungs[0]
+            units += self._advance(self.trials[-1])  # values that repeat have finished units
         return units
 
     def _trial(self, drawn: OptunaTrial) -> Trial:
@@ -225,6 +238,9 @@ class Tuner:
             trial.is_open = False
             return []
         races = trial.races[trial.rung]
+        if any(each.key in self._failed for each in (*trial.rungs[trial.rung], *races)):
+            trial.is_open = False
+            return []
         if not all(race.key in self._finished for race in races):
             return self._units(trial)
         score = _judge([race.folder(self.work) for race in races])["progress_m"]
@@ -240,7 +256,7 @@ class Tuner:
             trial.is_open = False
             return []
         trial.rung += 1
-        return self._units(trial)
+        return self._advance(trial)
 
     def _live(self, number: int) -> OptunaTrial:
         """Return a trial that values can be drawn for, from an earlier session as well."""
