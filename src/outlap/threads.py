@@ -1,9 +1,9 @@
 """How the threads of OpenMP wait for work, in Numba's parallel loops and in PyTorch.
 
 A thread that finds no work spins before it sleeps. By default GNU OpenMP spins for milliseconds and LLVM's for 200 ms,
-which takes the core from every other process: two simulators side by side on two cores each ran at 4 % of their speed
-alone. Spinning for about 0.2 ms keeps the speed of one process alone and leaves each of two about half of it
-(`benchmarks/side_by_side.py`).
+which takes the core from every other process: of two simulators side by side on two cores, each ran at 3 % of its speed
+alone. Spinning for about 0.2 ms leaves each of them a third, and one process alone 98 % (`outlap benchmark simulator
+--cars 1 --beams 108 --seconds 2`, alone and twice at once, two cores of a Xeon; see `benchmarks/side_by_side.py`).
 """
 
 from __future__ import annotations
