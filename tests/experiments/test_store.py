@@ -111,7 +111,7 @@ def test_an_error_of_a_copy_costs_no_work(
     other = Fake("other", ticks=2)
     done_with(store, other, tmp_path / "third")
     assert store.done() == {unit.key, other.key}
-    assert caplog.text.count("goes on, and is not copied") == 2
+    assert caplog.text.count("continues, but is not copied") == 2
 
 
 class Stopping(Fake):
