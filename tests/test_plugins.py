@@ -1,4 +1,4 @@
-"""Entry points are found by group and name; none and several are told apart."""
+"""Entry points are found by group and name; a missing one and a duplicate are reported."""
 
 from __future__ import annotations
 

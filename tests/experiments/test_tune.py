@@ -128,7 +128,7 @@ def test_trials_that_fall_behind_are_stopped_and_stay_so(tmp_path: Path):
     found = racer.run()
     assert found["gamma"].iloc[0] == 0.98
     assert found["steps"].iloc[0] == 256
-    # At the first rung, a trial goes on that is in the better half of those before it and itself.
+    # At the first rung, a trial continues if it is in the better half of the trials so far, itself included.
     assert sorted(steps for gamma, _, steps in racer.raced if gamma == 0.98) == [32, 128, 256]
     early = found[found["stopped_early"]]
     assert 4 <= len(early) < 8
