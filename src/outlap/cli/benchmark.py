@@ -49,7 +49,7 @@ class BenchmarkSimulator(LongCommand):
     tracks: tuple[str, ...] = ()
     """Names or map folders; the built-in training circuits by default."""
 
-    model: Literal["kinematic", "single_track", "drift"] = "single_track"
+    model: Literal["kinematic", "single_track", "nonlinear_single_track", "drift"] = "single_track"
     """Vehicle model."""
 
     integrator: Literal["euler", "rk4"] = "rk4"

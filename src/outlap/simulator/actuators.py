@@ -73,6 +73,56 @@ def acceleration(target_speed, speed, p):
 
 
 @njit(cache=True, error_model="numpy")
+def motor_force(target_speed, speed, p):
+    """The force [N] with which a car's motor controller follows a target speed [m/s].
+
+    Proportional to the error, as the speed loop of a motor controller, which knows no mass.
+
+    Args:
+        target_speed: [m/s].
+        speed: of the wheels, forward [m/s].
+        p: the car's parameters.
+    """
+    return limit_force(p.force_gain * (target_speed - speed), speed, p)
+
+
+@njit(cache=True, error_model="numpy")
+def limit_force(force, speed, p):
+    """A force [N] within what motor, its power, its highest speeds and the brakes allow.
+
+    A force against the motion is the brakes'; one along it is the motor's, of `motor_power` / |speed| at most.
+
+    Args:
+        force: positive forward [N].
+        speed: of the wheels, forward [m/s].
+        p: the car's parameters.
+    """
+    if force * speed < 0.0:
+        return min(max(force, -1.0 * p.brake_force), 1.0 * p.brake_force)
+    if (speed >= p.v_max and force > 0.0) or (speed <= p.v_min and force < 0.0):
+        return 0.0
+    most = min(1.0 * p.motor_force, p.motor_power / max(abs(speed), 1e-3))
+    return min(max(force, -most), most)
+
+
+@njit(cache=True, error_model="numpy")
+def ramp(value, command, dt, p):
+    """A commanded speed [m/s] that follows `command` no faster than `speed_ramp_up` and `speed_ramp_down` allow.
+
+    Args:
+        value: its value one step before [m/s].
+        command: [m/s].
+        dt: physics step [s].
+        p: the car's parameters.
+    """
+    if p.speed_ramp_up > 0.0:
+        command = min(command, value + p.speed_ramp_up * dt)
+    if p.speed_ramp_down > 0.0:
+        command = max(command, value - p.speed_ramp_down * dt)
+    return command
+
+
+@njit(cache=True, error_model="numpy")
 def lag(value, command, dt, time_constant):
     """A first-order lag, exact for a command held over the step: the next value.
 

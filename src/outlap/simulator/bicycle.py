@@ -64,8 +64,9 @@ def single_track(state, steer_rate, acceleration, p):
     direction = 1.0 if speed > 0.0 else -1.0
     inverse_speed = 1.0 / speed
     # Lateral forces divided by mass [m/s^2].
-    front = direction * p.mu * p.C_Sf * front_load * (steer - slip - p.lf * yaw_rate * inverse_speed)
-    rear = direction * p.mu * p.C_Sr * rear_load * (p.lr * yaw_rate * inverse_speed - slip)
+    friction = 1.0 * p.mu * p.road_friction
+    front = direction * friction * p.C_Sf * front_load * (steer - slip - p.lf * yaw_rate * inverse_speed)
+    rear = direction * friction * p.C_Sr * rear_load * (p.lr * yaw_rate * inverse_speed - slip)
     course = slip + yaw
     return (
         speed * math.cos(course),
@@ -88,12 +89,25 @@ def is_kinematic(speed, p):
 
 @njit(cache=True, error_model="numpy")
 def kinematic_speed(p, dt, integrator=RK4):
-    """The speed [m/s] below which a car's single-track model must become kinematic.
+    """The speed [m/s] below which the single-track model with linear tyres must become kinematic.
+
+    Args:
+        p: the car's parameters.
+        dt: physics step [s].
+        integrator: EULER or RK4.
+    """
+    return slowest_stable_speed(p.mu * p.C_Sf, p.mu * p.C_Sr, p, dt, integrator)
+
+
+@njit(cache=True, error_model="numpy")
+def slowest_stable_speed(front_slope, rear_slope, p, dt, integrator):
+    """The speed [m/s] below which a dynamic single-track model must become kinematic.
 
     The lateral modes of the single-track get faster as 1 / speed. Below this speed their rate times `dt`
     leaves the integrator's region of stability. At least 0.5 m/s, the F1TENTH gym's value.
 
     Args:
+        front_slope, rear_slope: of the axles' lateral force / load over the slip angle, at the origin [1/rad].
         p: the car's parameters.
         dt: physics step [s].
         integrator: EULER or RK4.
@@ -102,7 +116,7 @@ def kinematic_speed(p, dt, integrator=RK4):
     # The rate is convex in the axle loads: its largest value is at one end of the load transfer.
     for sign in (-1.0, 1.0):
         front_load, rear_load = axle_loads(sign * p.a_max, p)
-        rate = lateral_rate(p.mu * p.C_Sf * front_load, p.mu * p.C_Sr * rear_load, p)
+        rate = lateral_rate(front_slope * front_load, rear_slope * rear_load, p)
         fastest = max(fastest, rate)
     return max(0.5, fastest * dt / stability_bound(integrator))
 

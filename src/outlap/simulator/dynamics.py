@@ -1,7 +1,9 @@
-"""Vehicle dynamics: one physics step of a car, under three models and two integrators.
+"""Vehicle dynamics: one physics step of a car, under four models and two integrators.
 
 - KINEMATIC: wheels that never slip (`bicycle.kinematic`).
 - SINGLE_TRACK: linear tyres under load transfer; kinematic below `p.kinematic_speed` (`bicycle.single_track`).
+- NONLINEAR_SINGLE_TRACK: saturating tyres, a motor with a force and a power; kinematic below `p.kinematic_speed`
+  (`nonlinear.nonlinear_step`).
 - DRIFT: Pacejka tyres with combined slip and spinning wheels (`drift.drift`).
 
 Scalar functions. A state is a tuple in the order of `state`, float64; `p` is one car's parameters. The
@@ -20,6 +22,7 @@ from numba import njit
 
 from outlap.simulator.bicycle import (
     EULER,
+    GRAVITY,
     RK4,
     is_kinematic,
     kinematic,
@@ -27,16 +30,20 @@ from outlap.simulator.bicycle import (
     kinematic_values,
     rolling_wheel_speeds,
     single_track,
+    slowest_stable_speed,
     wrap_angle,
 )
 from outlap.simulator.drift import BLEND_SPEED, RELAXATION_TIME, drift, drift_substeps, drift_weight
+from outlap.simulator.nonlinear import axle_scale, nonlinear_step
 
 __all__ = [
     "DRIFT",
     "EULER",
     "KINEMATIC",
+    "NONLINEAR_SINGLE_TRACK",
     "RK4",
     "SINGLE_TRACK",
+    "derive",
     "drift",
     "integrate",
     "kinematic",
@@ -47,11 +54,28 @@ __all__ = [
     "wrap_angle",
 ]
 
-KINEMATIC, SINGLE_TRACK, DRIFT = 0, 1, 2
+KINEMATIC, SINGLE_TRACK, DRIFT, NONLINEAR_SINGLE_TRACK = range(4)
 
 # What no car exceeds, and a spinning one may under linear tyres or far outside a tyre's table.
 HIGHEST_YAW_RATE = 50.0  # [rad/s] eight turns a second
 HIGHEST_WHEEL_SPEED = 1.2  # times v_max / wheel_radius: the motor's limit under wheelspin, and so the car's
+
+
+@njit(cache=True, error_model="numpy")
+def derive(model, integrator, dt, p):
+    """Set what a model needs of a car's parameters beforehand: `kinematic_speed`, `front_scale`, `rear_scale`.
+
+    Args:
+        model, integrator, dt: as for `integrate`.
+        p: the car's parameters, changed in place.
+    """
+    p.front_scale = axle_scale(p.front_B, p.front_C, p.front_E)
+    p.rear_scale = axle_scale(p.rear_B, p.rear_C, p.rear_E)
+    front_slope, rear_slope = p.mu * p.C_Sf, p.mu * p.C_Sr
+    if model == NONLINEAR_SINGLE_TRACK:
+        front_slope = p.mu * p.front_peak * p.front_scale * p.front_C * p.front_B
+        rear_slope = p.mu * p.rear_peak * p.rear_scale * p.rear_C * p.rear_B
+    p.kinematic_speed = slowest_stable_speed(front_slope, rear_slope, p, dt, integrator)
 
 
 @njit(cache=True, error_model="numpy")
@@ -64,21 +88,24 @@ def integrate(model, integrator, state, steer_rate, acceleration, dt, p):
     and tyres need at the present speed (`drift.drift_substeps`).
 
     Args:
-        model: KINEMATIC, SINGLE_TRACK or DRIFT.
+        model: KINEMATIC, SINGLE_TRACK, DRIFT or NONLINEAR_SINGLE_TRACK.
         integrator: EULER or RK4 (classical, fourth order).
         state: tuple of N_STATE numbers, see `state`.
         steer_rate: [rad/s] and
-        acceleration: [m/s^2], within the car's limits, constant over the step.
+        acceleration: [m/s^2], within the car's limits, constant over the step; under NONLINEAR_SINGLE_TRACK the force
+            of motor or brakes divided by mass, of which the tyres transmit what they can.
         dt: [s].
         p: the car's parameters.
 
     Returns:
         The next state: yaw and slip in (-pi, pi]. Where tyres slip, yaw rate is within 50 rad/s; under SINGLE_TRACK
-        slip is within pi / 2, under DRIFT speed within 1.2 times v_min … v_max. Whatever the car and the driver, the
+        and NONLINEAR_SINGLE_TRACK slip is within pi / 2, under DRIFT speed within 1.2 times v_min … v_max. Whatever the car and the driver, the
         state stays finite.
     """
     if model == DRIFT:
         return _substepped_drift(integrator, state, steer_rate, acceleration, dt, p)
+    if model == NONLINEAR_SINGLE_TRACK:
+        return _nonlinear_or_kinematic(integrator, state, steer_rate, acceleration, dt, p)
     if model == KINEMATIC:
         state = _kinematic_step(integrator, state, steer_rate, acceleration, dt, p)
     else:
@@ -91,6 +118,24 @@ def integrate(model, integrator, state, steer_rate, acceleration, dt, p):
         # as far as the model can mean anything.
         slip = min(max(slip, -0.5 * math.pi), 0.5 * math.pi)
         yaw_rate = min(max(yaw_rate, -HIGHEST_YAW_RATE), HIGHEST_YAW_RATE)
+    wheel_speed = speed / p.wheel_radius
+    return x, y, steer, speed, wrap_angle(yaw), yaw_rate, slip, wheel_speed, wheel_speed
+
+
+@njit(cache=True, error_model="numpy")
+def _nonlinear_or_kinematic(integrator, state, steer_rate, acceleration, dt, p):
+    """A step of the nonlinear single-track model: kinematic below `p.kinematic_speed`, forwards and in reverse."""
+    if is_kinematic(state[3], p):
+        grip = p.grip_share * p.mu * p.road_friction * GRAVITY
+        push = min(max(acceleration, -grip), grip)
+        x, y, steer, speed, yaw, yaw_rate, slip, _, _ = _kinematic_step(integrator, state, steer_rate, push, dt, p)
+    else:
+        x, y, steer, speed, yaw, yaw_rate, slip = nonlinear_step(
+            integrator == RK4, state, steer_rate, acceleration, dt, p
+        )
+    if is_kinematic(speed, p):
+        yaw_rate, slip = kinematic_values(steer, speed, p)
+    yaw_rate = min(max(yaw_rate, -HIGHEST_YAW_RATE), HIGHEST_YAW_RATE)
     wheel_speed = speed / p.wheel_radius
     return x, y, steer, speed, wrap_angle(yaw), yaw_rate, slip, wheel_speed, wheel_speed
 

@@ -15,25 +15,54 @@ import numpy as np
 from numba import njit, prange
 
 from outlap.simulator import state as column
-from outlap.simulator.actuators import acceleration, delay_steps, lag, steering_rate
+from outlap.simulator.actuators import (
+    acceleration,
+    delay_steps,
+    lag,
+    limit_acceleration,
+    limit_force,
+    motor_force,
+    ramp,
+    steering_rate,
+)
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
 from outlap.simulator.collision import FREE, HIT_CAR, HIT_WALL, REMOVED, rectangles_overlap, touches_wall
 from outlap.simulator.dynamics import (
     KINEMATIC,
+    NONLINEAR_SINGLE_TRACK,
+    derive,
     integrate,
-    kinematic_speed,
     kinematic_values,
     rolling_wheel_speeds,
     wrap_angle,
 )
+from outlap.simulator.elementary import cosine_wide
 from outlap.simulator.frenet import frenet_point, frenet_project
 from outlap.simulator.lidar import apply_sensor_noise, cast_car, cast_walls
 from outlap.simulator.seeding import hash64
-from outlap.simulator.worlds import ARC_LENGTH, HEADING_ERROR, OFFSET, Constants, Worlds
+from outlap.simulator.sensors import measure
+from outlap.simulator.worlds import ACCELERATION, ARC_LENGTH, HEADING_ERROR, OFFSET, Constants, Worlds
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _drive(constants, worlds, w, c, steer_command, speed_command):
+def _push(constants, target, now, p):
+    """The acceleration [m/s^2] that motor or brakes ask for, given the command that has arrived."""
+    speed = now[column.SPEED]
+    if constants.model == NONLINEAR_SINGLE_TRACK:
+        speed *= cosine_wide(now[column.SLIP])  # the wheels'
+        if constants.command != ACCELERATION:
+            return motor_force(target, speed, p) / p.m
+    elif constants.command != ACCELERATION:
+        return acceleration(target, speed, p)
+    if target < 0.0 and speed <= 0.0:  # brakes hold a car; only a speed command reverses it
+        return 0.0
+    if constants.model == NONLINEAR_SINGLE_TRACK:
+        return limit_force(target * (p.motor_force if target > 0.0 else p.brake_force), speed, p) / p.m
+    return limit_acceleration(target * p.a_max, speed, p)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _drive(atlas, constants, worlds, w, c, steer_command, speed_command):
     """One physics step of one car, walls aside."""
     p = worlds.params[w, c]
     state = worlds.state[w, c]
@@ -48,8 +77,18 @@ def _drive(constants, worlds, w, c, steer_command, speed_command):
     speed_target = worlds.delayed[w, c, (slot - min(speed_late, slots - 1)) % slots, 1]
     steer_target = lag(worlds.lagged[w, c, 0], steer_target, dt, p.steer_lag)
     speed_target = lag(worlds.lagged[w, c, 1], speed_target, dt, p.speed_lag)
+    if constants.command != ACCELERATION:
+        speed_target = ramp(worlds.lagged[w, c, 1], speed_target, dt, p)
     worlds.lagged[w, c, 0] = steer_target
     worlds.lagged[w, c, 1] = speed_target
+
+    angle = p.steer_ratio * steer_target + p.steer_trim
+
+    parts = worlds.road.shape[1]
+    if parts > 0:
+        track = worlds.track[w]
+        length = atlas.index[track, ROWS] * atlas.frame[track, SPACING]
+        p.road_friction = worlds.road[w, min(int(worlds.frenet[w, c, ARC_LENGTH] / length * parts), parts - 1)]
 
     worlds.before[w, c, 0] = state[column.X]
     worlds.before[w, c, 1] = state[column.Y]
@@ -62,8 +101,8 @@ def _drive(constants, worlds, w, c, steer_command, speed_command):
     )  # fmt: skip
     h = dt / constants.substeps
     for _ in range(constants.substeps):
-        rate = steering_rate(steer_target, now[column.STEER], h, p)
-        push = acceleration(speed_target, now[column.SPEED], p)
+        rate = steering_rate(angle, now[column.STEER], h, p)
+        push = _push(constants, speed_target, now, p)
         now = integrate(constants.model, constants.integrator, now, rate, push, h, p)
     for k in range(len(now)):
         state[k] = now[k]
@@ -184,27 +223,50 @@ def _progress(atlas, constants, worlds, w, c):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _scan(atlas, constants, worlds, w, c):
-    """The scan of one car as the world stands."""
+def _pose(worlds, w, c, late):
+    """The pose of a car some physics steps ago, as far back as poses are kept."""
+    slots = worlds.poses.shape[2]
+    if slots == 1:
+        state = worlds.state[w, c]
+        return float(state[column.X]), float(state[column.Y]), float(state[column.YAW])
+    pose = worlds.poses[w, c, (worlds.tick[w] - min(late, slots - 1)) % slots]
+    return float(pose[0]), float(pose[1]), float(pose[2])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _keep_pose(worlds, w, c):
+    slots = worlds.poses.shape[2]
+    if slots > 1:
+        pose, state = worlds.poses[w, c, worlds.tick[w] % slots], worlds.state[w, c]
+        pose[0], pose[1], pose[2] = state[column.X], state[column.Y], state[column.YAW]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _sense(atlas, constants, worlds, w, c):
+    """What one car measures as the world stands: its motion and its scan."""
+    measure(constants, worlds, w, c)
     scan = worlds.scan[w, c]
     if scan.shape[0] == 0:
         return
-    p, state = worlds.params[w, c], worlds.state[w, c]
-    yaw = float(state[column.YAW])
-    x = state[column.X] + p.mount_x * math.cos(yaw)
-    y = state[column.Y] + p.mount_x * math.sin(yaw)
+    p = worlds.params[w, c]
+    late = int(p.latency / constants.timestep + 0.5)
+    x, y, yaw = _pose(worlds, w, c, late)
+    x += p.mount_x * math.cos(yaw) - p.mount_y * math.sin(yaw)
+    y += p.mount_x * math.sin(yaw) + p.mount_y * math.cos(yaw)
+    yaw += p.mount_yaw
     beam_cos, beam_sin, max_range = constants.beam_cos, constants.beam_sin, p.max_range
     cast_walls(atlas, worlds.track[w], x, y, yaw, beam_cos, beam_sin, max_range, scan)
     for other in range(worlds.state.shape[1]):
         if other == c or worlds.contact[w, other] == REMOVED:
             continue
-        body, size = worlds.state[w, other], worlds.params[w, other]
-        dx, dy = body[column.X] - x, body[column.Y] - y
+        size = worlds.params[w, other]
+        other_x, other_y, other_yaw = _pose(worlds, w, other, late)
+        dx, dy = other_x - x, other_y - y
         reach = max_range + size.length
         if dx * dx + dy * dy < reach * reach:
             cast_car(
                 x, y, yaw, beam_cos, beam_sin,
-                float(body[column.X]), float(body[column.Y]), float(body[column.YAW]),
+                other_x, other_y, other_yaw,
                 0.5 * size.length, 0.5 * size.width, scan,
             )  # fmt: skip
     key = hash64(hash64(worlds.key[w], np.uint64(worlds.tick[w])), np.uint64(c))
@@ -219,12 +281,13 @@ def _step_world(atlas, constants, worlds, w, commands, repeats):
         worlds.tick[w] += 1
         for c in range(cars):
             if worlds.contact[w, c] == FREE:
-                _drive(constants, worlds, w, c, commands[w, c, 0], commands[w, c, 1])
+                _drive(atlas, constants, worlds, w, c, commands[w, c, 0], commands[w, c, 1])
         _collide(atlas, worlds, w)
         for c in range(cars):
             _progress(atlas, constants, worlds, w, c)
+            _keep_pose(worlds, w, c)
     for c in range(cars):
-        _scan(atlas, constants, worlds, w, c)
+        _sense(atlas, constants, worlds, w, c)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -233,7 +296,7 @@ def step_worlds(atlas: Atlas, constants: Constants, worlds: Worlds, commands: np
 
     Args:
         atlas, constants, worlds: see `atlas` and `worlds`.
-        commands: (worlds, cars, 2) steering angle [rad] and speed [m/s].
+        commands: (worlds, cars, 2) steering angle [rad] and speed [m/s] or share of the largest force, see `Simulator`.
         repeats: physics steps.
     """
     for w in prange(worlds.state.shape[0]):
@@ -247,7 +310,7 @@ def _put(atlas, constants, worlds, w, c, start):
     rows, spacing = atlas.index[track, ROWS], atlas.frame[track, SPACING]
     x, y, heading = frenet_point(atlas.line, atlas.index[track, FIRST_ROW], rows, spacing, start[0], start[1])
     p, state = worlds.params[w, c], worlds.state[w, c]
-    p.kinematic_speed = kinematic_speed(p, constants.timestep / constants.substeps, constants.integrator)
+    derive(constants.model, constants.integrator, constants.timestep / constants.substeps, p)
     speed = float(start[3])
     state[:] = 0.0
     state[column.X], state[column.Y] = x, y
@@ -259,10 +322,14 @@ def _put(atlas, constants, worlds, w, c, start):
     state[column.WHEEL_SPEED_FRONT], state[column.WHEEL_SPEED_REAR] = front, rear
     worlds.before[w, c, 0], worlds.before[w, c, 1] = x, y
     worlds.before[w, c, 2] = state[column.YAW]
+    held = 0.0 if constants.command == ACCELERATION else speed
     worlds.delayed[w, c, :, 0] = 0.0
-    worlds.delayed[w, c, :, 1] = speed
+    worlds.delayed[w, c, :, 1] = held
     worlds.lagged[w, c, 0] = 0.0
-    worlds.lagged[w, c, 1] = speed
+    worlds.lagged[w, c, 1] = held
+    for slot in range(worlds.poses.shape[2]):
+        for k in range(3):
+            worlds.poses[w, c, slot, k] = worlds.before[w, c, k]
 
     worlds.contact[w, c] = FREE
     worlds.impact_speed[w, c] = 0.0
@@ -288,17 +355,19 @@ def _place(atlas, constants, worlds, w, c, start):
 
 # Apart from the parallel loop below, in which Numba would lose the assignment of rows.
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _reset_world(atlas, constants, worlds, w, key, track, params, starts):
+def _reset_world(atlas, constants, worlds, w, key, track, params, starts, road):
     worlds.key[w] = key
     worlds.track[w] = track
     worlds.time[w] = 0.0
     worlds.tick[w] = 0
+    for part in range(road.shape[0]):
+        worlds.road[w, part] = road[part]
     for c in range(worlds.state.shape[1]):
         worlds.params[w, c] = params[c]
         _place(atlas, constants, worlds, w, c, starts[c])
     _collide(atlas, worlds, w)
     for c in range(worlds.state.shape[1]):
-        _scan(atlas, constants, worlds, w, c)
+        _sense(atlas, constants, worlds, w, c)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -311,6 +380,7 @@ def reset_worlds(
     tracks: np.ndarray,
     params: np.ndarray,
     starts: np.ndarray,
+    road: np.ndarray,
 ) -> None:
     """Begin an episode in some worlds and scan.
 
@@ -321,9 +391,10 @@ def reset_worlds(
         tracks: (n,) numbers in the atlas.
         params: PARAMETERS (n, cars).
         starts: (n, cars, 4) arc length [m], offset [m], heading error [rad], speed [m/s].
+        road: float32 (n, bins), see `Worlds.road`.
     """
     for i in prange(which.shape[0]):
-        _reset_world(atlas, constants, worlds, which[i], keys[i], tracks[i], params[i], starts[i])
+        _reset_world(atlas, constants, worlds, which[i], keys[i], tracks[i], params[i], starts[i], road[i])
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -343,7 +414,7 @@ def _respawn(atlas, constants, worlds, w, c, clearance):
     p = worlds.params[w, c]
     if not touches_wall(atlas, track, x, y, yaw, 0.5 * p.length, 0.5 * p.width):
         _put(atlas, constants, worlds, w, c, start)
-        _scan(atlas, constants, worlds, w, c)
+        _sense(atlas, constants, worlds, w, c)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -14,13 +14,21 @@ from outlap.errors import OutlapError
 from outlap.simulator import kernels
 from outlap.simulator.atlas import build_atlas
 from outlap.simulator.collision import REMOVED
-from outlap.simulator.dynamics import DRIFT, EULER, KINEMATIC, RK4, SINGLE_TRACK
+from outlap.simulator.dynamics import DRIFT, EULER, KINEMATIC, NONLINEAR_SINGLE_TRACK, RK4, SINGLE_TRACK
 from outlap.simulator.lidar import beam_directions
 from outlap.simulator.vehicle import PARAMETERS, accepted_bounds, parameter_names, to_values
-from outlap.simulator.worlds import Constants, allocate_worlds
+from outlap.simulator.worlds import ACCELERATION, FULL, SPEED, VESC, Constants, allocate_worlds
 from outlap.track.track import Track
 
-MODELS = {"kinematic": KINEMATIC, "single_track": SINGLE_TRACK, "drift": DRIFT}
+Model = Literal["kinematic", "single_track", "nonlinear_single_track", "drift"]
+MODELS = {
+    "kinematic": KINEMATIC,
+    "single_track": SINGLE_TRACK,
+    "nonlinear_single_track": NONLINEAR_SINGLE_TRACK,
+    "drift": DRIFT,
+}
+COMMANDS = {"speed": SPEED, "acceleration": ACCELERATION}
+ODOMETRIES = {"full": FULL, "vesc": VESC}
 INTEGRATORS = {"euler": EULER, "rk4": RK4}
 MAX_DELAY_STEPS = 1000
 MAX_COMMAND = 1e6  # beyond any stop and any speed, and far from where single precision ends
@@ -29,10 +37,14 @@ MAX_COMMAND = 1e6  # beyond any stop and any speed, and far from where single pr
 class SimulatorConfig(Config):
     """Physics and scanner that all worlds share."""
 
-    model: Literal["kinematic", "single_track", "drift"] = "single_track"
+    model: Model = "single_track"
     integrator: Literal["euler", "rk4"] = "rk4"
     timestep: float = Field(default=0.01, gt=0, le=0.1)  # of physics [s]
     substeps: int = Field(default=1, ge=1)  # integrator steps per physics step
+    command: Literal["speed", "acceleration"] = "speed"
+    """What a car's second command is: a speed that a controller follows, or a share of the largest drive or brake."""
+    odometry: Literal["full", "vesc"] = "full"
+    """How a car measures its motion; `vesc`: no lateral speed, yaw rate from the steering command, as a stock VESC."""
     beams: int = Field(default=540, ge=0, le=1080)
     field_of_view: float = Field(default=4.7, gt=0, le=2 * np.pi)  # between the outermost beams [rad]
 
@@ -50,6 +62,8 @@ class Simulator:
         num_cars: int = 1,
         config: SimulatorConfig | None = None,
         max_delay: float = 0.0,
+        max_latency: float = 0.0,
+        road_bins: int = 0,
     ) -> None:
         """Allocate the worlds; `reset` each before the first `step`.
 
@@ -58,6 +72,8 @@ class Simulator:
             num_worlds, num_cars: at least 1 each.
             config: physics and scanner.
             max_delay: the longest actuator delay that will occur [s].
+            max_latency: the longest latency of a scan that will occur [s].
+            road_bins: equal parts of the lap, each of which `reset` gives a friction.
 
         Raises OutlapError for a value out of range.
         """
@@ -66,17 +82,20 @@ class Simulator:
         _check(num_worlds >= 1, "num_worlds", num_worlds, "it must be at least 1")
         _check(num_cars >= 1, "num_cars", num_cars, "it must be at least 1")
         _check(0.0 <= max_delay < np.inf, "max_delay", max_delay, "it must be 0 s or more")
-        slots = round(max_delay / config.timestep) + 1
+        _check(0.0 <= max_latency < np.inf, "max_latency", max_latency, "it must be 0 s or more")
+        _check(road_bins >= 0, "road_bins", road_bins, "it must be 0 or more")
+        slots, pose_slots = (round(longest / config.timestep) + 1 for longest in (max_delay, max_latency))
         _check(slots <= MAX_DELAY_STEPS, "max_delay", max_delay, f"at most {MAX_DELAY_STEPS} steps are kept")
+        _check(pose_slots <= MAX_DELAY_STEPS, "max_latency", max_latency, f"at most {MAX_DELAY_STEPS} steps are kept")
         self.config = config
         self.tracks = tuple(tracks)
         self.num_worlds = num_worlds
         self.num_cars = num_cars
         self.atlas = build_atlas(self.tracks)
-        self.worlds = allocate_worlds(num_worlds, num_cars, slots, config.beams)
+        self.worlds = allocate_worlds(num_worlds, num_cars, slots, config.beams, pose_slots, road_bins)
         self._constants = Constants(
             MODELS[config.model], INTEGRATORS[config.integrator], config.timestep, config.substeps,
-            *beam_directions(config.beams, config.field_of_view),
+            COMMANDS[config.command], ODOMETRIES[config.odometry], *beam_directions(config.beams, config.field_of_view),
         )  # fmt: skip
         cars = (num_worlds, num_cars)
         self._commands = np.zeros((*cars, 2), np.float32)
@@ -92,6 +111,7 @@ class Simulator:
         tracks: np.ndarray,
         params: np.ndarray,
         starts: np.ndarray,
+        road: np.ndarray | None = None,
     ) -> None:
         """Begin an episode in some worlds; their scans are ready afterwards.
 
@@ -101,6 +121,7 @@ class Simulator:
             tracks: (n,) positions in `tracks`.
             params: (n, cars) records of `vehicle.PARAMETERS`, within `vehicle.accepted_bounds`.
             starts: (n, cars, 4) arc length [m], offset to the left [m], heading error [rad], speed [m/s].
+            road: (n, road_bins) friction of equal parts of the lap / mu, in (0, 1]; None: 1 everywhere.
         """
         which = np.asarray(which)
         _check(which.ndim == 1 and which.dtype != bool, "which", which, "it must be (n,) indices of worlds")
@@ -116,6 +137,9 @@ class Simulator:
         _check_shape("tracks", tracks, (n,))
         _check_shape("params", params, (n, cars))
         _check_shape("starts", starts, (n, cars, 4))
+        road_bins = self.worlds.road.shape[1]
+        road = np.ones((n, road_bins), np.float32) if road is None else np.ascontiguousarray(road, np.float32)
+        _check_shape("road", road, (n, road_bins))
         if n == 0:
             return
         # Few worlds end at a time: plain Python checks a handful sooner than NumPy.
@@ -130,9 +154,13 @@ class Simulator:
         late = max(params["steer_delay"].max(), params["speed_delay"].max()) / self.config.timestep
         if late >= slots - 0.5 + 1e-3:
             _check(False, "params", f"a delay of {late:.1f} steps", "raise max_delay")
+        _check(bool(((road > 0.0) & (road <= 1.0)).all()), "road", "out of range", "it must be in (0, 1]")
+        pose_slots = self.worlds.poses.shape[2]
+        late = float(params["latency"].max()) / self.config.timestep
+        _check(late < pose_slots - 0.5 + 1e-3, "params", f"a latency of {late:.1f} steps", "raise max_latency")
         self._timed(
             kernels.reset_worlds, self.atlas, self._constants, self.worlds, which,
-            keys, tracks, params, starts,
+            keys, tracks, params, starts, road,
         )  # fmt: skip
         self._started[which] = True
 
@@ -140,7 +168,8 @@ class Simulator:
         """Advance every world by `repeats` physics steps under constant commands, then scan.
 
         Args:
-            commands: (worlds, cars, 2) steering angle [rad], left positive, and speed [m/s].
+            commands: (worlds, cars, 2) steering angle [rad], left positive, and speed [m/s]; where `config.command` is
+                `acceleration`, a share of the largest driving (positive) or braking (negative) force in place of speed.
             repeats: physics steps.
 
         Raises OutlapError where a command is not a number within 1e6 or a world was never reset.

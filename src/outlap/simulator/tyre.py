@@ -35,7 +35,7 @@ def tyre_forces(slip, slip_angle, load, p):
     Returns:
         longitudinal, lateral [N].
     """
-    friction = 1.0 * p.mu  # a float64 from here on
+    friction = 1.0 * p.mu * p.road_friction  # a float64 from here on
     # Pacejka's lambda_mu: it scales the peaks and leaves the slopes at the origin alone.
     peak_x = p.p_dx1 * friction / p.p_dy1
 

@@ -31,6 +31,17 @@ ReverseSpeed = Annotated[Number, bounded(at_least=-200, at_most=0)]  # [m/s]
 LeftAngle = Annotated[Number, bounded(at_least=0.01, below=1.5)]  # [rad]
 RightAngle = Annotated[Number, bounded(above=-1.5, at_most=-0.01)]
 Gain = Annotated[Number, bounded(at_least=0.01, at_most=1e9)]
+ForceGain = Annotated[Number, bounded(at_least=0.01, at_most=1e6)]  # [N s/m]
+Force = Annotated[Number, bounded(at_least=0.01, at_most=1e6)]  # [N]
+Power = Annotated[Number, bounded(at_least=0.01, at_most=1e8)]  # [W]
+Ramp = Annotated[Number, bounded(at_least=0, at_most=1000)]  # [m/s^2]; 0 = none
+SmallAngle = Annotated[Number, bounded(at_least=-0.5, at_most=0.5)]  # [rad]
+Ratio = Annotated[Number, bounded(at_least=0.1, at_most=10)]  # [-]
+FallingShape = Annotated[Number, bounded(at_least=0.01, at_most=1.95)]  # [-] at 2 the force would vanish
+Curvature = Annotated[Number, bounded(at_least=-20, at_most=2)]  # [-]
+MeasuredSpeedError = Annotated[Number, bounded(at_least=0, at_most=100)]  # [m/s]
+MeasuredRateError = Annotated[Number, bounded(at_least=-10, at_most=10)]  # [rad/s]
+MeasuredRateDeviation = Annotated[Number, bounded(at_least=0, at_most=10)]  # [rad/s]
 Duration = Annotated[Number, bounded(at_least=0, at_most=1000)]  # [s]
 Range = Annotated[Number, bounded(at_least=0.01, at_most=1000)]  # [m]
 RangeError = Annotated[Number, bounded(at_least=-1000, at_most=1000)]  # [m]
@@ -73,11 +84,35 @@ class PacejkaTyre(Config):
     r_vy6: Coefficient = -10.704  # its change with slip: slope [-]
 
 
+class AxleTyres(Config):
+    """Magic Formula coefficients of the axles in the nonlinear single-track model.
+
+    The lateral force of an axle is -mu peak F_z sin(C arctan(B a - E (B a - arctan(B a)))) / p, with the slip angle a
+    and the largest value p of the sine up to a = pi / 2: `mu` times `peak` is the peak friction coefficient, also where
+    C < 1 and the sine never reaches 1. Beyond its peak the force falls and keeps its sign, since C < 2. Where E > 1 the
+    formula would fall through zero at large slip angles; there the force stays at its peak.
+
+    The default stiffness at the origin is the F1TENTH gym's, B = C_S / C; the shape C is that of `PacejkaTyre`.
+    """
+
+    front_B: Stiffness = 3.4930  # stiffness factor [1/rad]
+    front_C: FallingShape = 1.3507  # shape factor [-]
+    front_E: Curvature = 0.0  # curvature factor [-]
+    front_peak: Shape = 1.0  # peak friction of the axle / mu [-]
+    rear_B: Stiffness = 4.0395  # [1/rad]
+    rear_C: FallingShape = 1.3507  # [-]
+    rear_E: Curvature = 0.0  # [-]
+    rear_peak: Shape = 1.0  # [-]
+
+
 class VehicleParams(Config):
     """A car. The default is the F1TENTH gym's 1:10 car.
 
     The wheels' radius and inertia, which only the drift model reads, are those of a 1:10 all-wheel-drive
     chassis: 0.1 m wheels of about 0.12 kg, two an axle, plus the motor's rotor through the gearbox.
+
+    `nonlinear_single_track` takes motor and brakes as forces; the default ones give the car of the default mass `a_max`
+    and `v_switch`, by which the other models go.
     """
 
     mu: Friction = 1.0489  # tyre-road friction [-]
@@ -96,30 +131,56 @@ class VehicleParams(Config):
     steer_rate_max: Rate = 3.2  # either way [rad/s]
     a_max: Rate = 9.51  # either way [m/s^2]
     v_switch: Speed = 7.319  # above it, power limits acceleration to a_max v_switch / v [m/s]
+    motor_force: Force = 35.57  # largest driving force [N]
+    motor_power: Power = 260.3  # largest power of the motor [W]
+    brake_force: Force = 35.57  # largest braking force [N]
     v_min: ReverseSpeed = -5.0  # fastest reverse [m/s]
     v_max: Speed = 20.0  # fastest forward [m/s]
     wheel_radius: Distance = 0.0508  # [m]
     wheel_inertia: Inertia = 6e-4  # of an axle about its spin, with its share of the drive train [kg m^2]
     brake_split: Fraction = 0.5  # front share of the braking torque [-]
     engine_split: Fraction = 0.5  # front share of the driving torque [-]
+    axles: AxleTyres = AxleTyres()  # of the nonlinear single-track model
     tyre: PacejkaTyre = PacejkaTyre()  # of the drift model
 
 
 class ActuatorParams(Config):
-    """How commands (steering angle, speed) become a steering rate and an acceleration."""
+    """How commands (steering angle, speed) become a steering rate and an acceleration.
 
+    `nonlinear_single_track` follows the speed with a force of `force_gain` times the error; all other models with the
+    F1TENTH gym's controller and `speed_gain`.
+    """
+
+    steer_trim: SmallAngle = 0.0  # steering angle at the command 0 [rad]
+    steer_ratio: Ratio = 1.0  # steering angle / commanded angle [-]
     steer_gain: Gain = 1e6  # steering rate / angle error; 1 / step or more is bang-bang [1/s]
     steer_delay: Duration = 0.0  # rounded to physics steps [s]
     steer_lag: Duration = 0.0  # time constant of a first-order lag; 0 = none [s]
     speed_gain: Gain = 10.0  # the F1TENTH gym's: acceleration = gain a_max / v_max, speed error [-]
     speed_delay: Duration = 0.0  # rounded to physics steps [s]
     speed_lag: Duration = 0.0  # time constant of a first-order lag; 0 = none [s]
+    speed_ramp_up: Ramp = 0.0  # largest growth of the commanded speed; 0 = none [m/s^2]
+    speed_ramp_down: Ramp = 0.0  # largest fall of the commanded speed; 0 = none [m/s^2]
+    force_gain: ForceGain = 6.7  # force / speed error [N s/m]
+    grip_share: Fraction = 1.0  # of an axle's grip for drive and brakes; 1 = wheels may lock, less = anti-lock [-]
+
+
+class SensorParams(Config):
+    """Errors of the measured motion, which a policy observes. Rewards and results use the true motion."""
+
+    speed_scale: Ratio = 1.0  # measured / true velocity [-]
+    speed_noise: MeasuredSpeedError = 0.0  # standard deviation of the measured velocity [m/s]
+    yaw_rate_bias: MeasuredRateError = 0.0  # added to the measured yaw rate [rad/s]
+    yaw_rate_noise: MeasuredRateDeviation = 0.0  # standard deviation of the measured yaw rate [rad/s]
 
 
 class LidarParams(Config):
     """Where the scanner sits and what is wrong with its ranges."""
 
     mount_x: Place = 0.0  # in front of the centre of gravity [m]
+    mount_y: Place = 0.0  # to the left of it [m]
+    mount_yaw: SmallAngle = 0.0  # heading of the scanner's x axis in the car's frame [rad]
+    latency: Duration = 0.0  # age of the poses that a scan shows, rounded to physics steps [s]
     max_range: Range = 30.0  # [m]
     noise_std: Deviation = 0.0  # Gaussian, independent per beam [m]
     bias: RangeError = 0.0  # added to every range [m]
@@ -128,15 +189,26 @@ class LidarParams(Config):
 
 PRESETS: dict[str, VehicleParams] = {
     "f1tenth": VehicleParams(),
-    "paper": VehicleParams(mu=0.8, a_max=6.34, v_min=-8.0, v_max=8.0),
-}
+    "paper": VehicleParams(mu=0.8, a_max=6.34, v_min=-8.0, v_max=8.0, motor_force=23.71, motor_power=173.5),
+    # Identified on a real car by the ForzaETH race stack (Baumann et al., 2024): B, C, D, E front 5.5405, 0.4182, 1.8635,
+    # 0.3722, rear 6.6014, 0.5624, 1.7327, 1.0648. D sin(C arctan(...)) peaks at 1.0335 in front and 0.8024 behind.
+    "forzaeth": VehicleParams(
+        mu=1.0335, m=3.54, I=0.05797, lf=0.162, lr=0.145, h=0.014, v_max=10.0,
+        axles=AxleTyres(
+            front_B=5.5405, front_C=0.4182, front_E=0.3722, front_peak=1.0,
+            rear_B=6.6014, rear_C=0.5624, rear_E=1.0648, rear_peak=0.7764,
+        ),
+    ),
+}  # fmt: skip
 
 
 # The models that make up a car, each with the prefix of its parameters in results.
 _MODELS: tuple[tuple[str, type[Config]], ...] = (
     ("vehicle", VehicleParams),
+    ("vehicle_axles", AxleTyres),
     ("vehicle_tyre", PacejkaTyre),
     ("actuators", ActuatorParams),
+    ("sensors", SensorParams),
     ("lidar", LidarParams),
 )
 _FIELDS = [
@@ -146,11 +218,15 @@ _FIELDS = [
     if not isinstance(field.default, Config)
 ]
 
-NAMES = (*(name for _, _, name in _FIELDS), "kinematic_speed")
-"""A car's parameters: the numbers of its models in the order of their fields, and `kinematic_speed` [m/s].
+DERIVED = {"kinematic_speed": 0.0, "front_scale": 0.0, "rear_scale": 0.0, "road_friction": 1.0}
+"""What the simulator derives, with its value before that.
 
-The simulator sets the last one to `dynamics.kinematic_speed` of the car at each reset.
+At each reset: `kinematic_speed` [m/s] of `dynamics.kinematic_speed`, and the factors of `nonlinear.axle_scale` [-]. At
+each step: `road_friction` [-], the share of `mu` that the road gives where the car is.
 """
+
+NAMES = (*(name for _, _, name in _FIELDS), *DERIVED)
+"""A car's parameters: the numbers of its models in the order of their fields, then the derived ones."""
 
 N_PARAMS = len(NAMES)
 
@@ -169,7 +245,10 @@ def to_values(params: np.ndarray) -> np.ndarray:
 
 
 def parameter_bounds(
-    vehicle: VehicleParams, actuators: ActuatorParams | None = None, lidar: LidarParams | None = None
+    vehicle: VehicleParams,
+    actuators: ActuatorParams | None = None,
+    lidar: LidarParams | None = None,
+    sensors: SensorParams | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the smallest and the largest value of each parameter of a configuration.
 
@@ -177,19 +256,22 @@ def parameter_bounds(
         vehicle: the car.
         actuators: its actuators; none gives the default ones.
         lidar: its scanner; none gives the default one.
+        sensors: its other sensors; none gives perfect ones.
 
     Returns:
         low, high: float32 (N_PARAMS,) each, equal where a value is fixed. Sample uniformly between them and pass the
-        rows to `to_records`. `kinematic_speed` is 0 in both.
+        rows to `to_records`. Derived parameters have their values of `DERIVED`.
     """
     parts = {
         VehicleParams: vehicle,
+        AxleTyres: vehicle.axles,
         PacejkaTyre: vehicle.tyre,
         ActuatorParams: actuators or ActuatorParams(),
+        SensorParams: sensors or SensorParams(),
         LidarParams: lidar or LidarParams(),
     }
     ends = [bounds(getattr(parts[model], name)) for _, model, name in _FIELDS]
-    low, high = np.array([*ends, (0.0, 0.0)], np.float32).T.copy()
+    low, high = np.array([*ends, *((value, value) for value in DERIVED.values())], np.float32).T.copy()
     return low, high
 
 
@@ -200,11 +282,11 @@ def accepted_bounds() -> tuple[np.ndarray, np.ndarray]:
     `v_max` may also be 0: an opponent that stands still.
     """
     ends = [widest(model, name) for _, model, name in _FIELDS]
-    low, high = np.array([*ends, (0.0, np.finfo(np.float32).max)], np.float32).T.copy()
+    low, high = np.array([*ends, *((0.0, np.finfo(np.float32).max) for _ in DERIVED)], np.float32).T.copy()
     low[NAMES.index("v_max")] = 0.0
     return low, high
 
 
 def parameter_names() -> list[str]:
     """Return the name of each parameter in results: `vehicle_mu`, `lidar_noise_std`."""
-    return [f"{prefix}_{name}" for prefix, _, name in _FIELDS] + ["kinematic_speed"]
+    return [f"{prefix}_{name}" for prefix, _, name in _FIELDS] + list(DERIVED)

@@ -11,15 +11,23 @@ from outlap.simulator.vehicle import PARAMETERS
 
 # Columns of Worlds.frenet
 ARC_LENGTH, OFFSET, HEADING_ERROR = range(3)
+# Columns of Worlds.measured
+FORWARD, LEFTWARD, YAW_RATE, STEER, SLIP = range(5)
+# Constants.command: what the second command of a car is
+SPEED, ACCELERATION = range(2)
+# Constants.odometry: how a car measures its motion
+FULL, VESC = range(2)
 
 
 class Constants(NamedTuple):
     """What all worlds of a simulator share."""
 
-    model: int  # KINEMATIC, SINGLE_TRACK or DRIFT
+    model: int  # KINEMATIC, SINGLE_TRACK, DRIFT or NONLINEAR_SINGLE_TRACK
     integrator: int  # EULER or RK4
     timestep: float  # [s] of physics
     substeps: int  # integrator steps per physics step
+    command: int  # SPEED or ACCELERATION
+    odometry: int  # FULL or VESC
     beam_cos: np.ndarray  # float32, see `lidar.beam_directions`
     beam_sin: np.ndarray
 
@@ -33,7 +41,10 @@ class Worlds(NamedTuple):
     tick: np.ndarray  # int64 (worlds,) physics steps since the reset
     params: np.ndarray  # PARAMETERS (worlds, cars)
     state: np.ndarray  # float32 (worlds, cars, N_STATE)
+    measured: np.ndarray  # float32 (worlds, cars, 5): FORWARD, LEFTWARD [m/s], YAW_RATE [rad/s], STEER, SLIP [rad]
+    road: np.ndarray  # float32 (worlds, bins): friction of equal parts of the lap / mu; without bins 1 everywhere
     before: np.ndarray  # float32 (worlds, cars, 3): x, y, yaw one physics step ago
+    poses: np.ndarray  # float32 (worlds, cars, pose slots, 3): ring of the latest x, y, yaw, for late scans
     delayed: np.ndarray  # float32 (worlds, cars, slots, 2): ring of the latest commands
     lagged: np.ndarray  # float32 (worlds, cars, 2): commands behind delay and lag
     frenet: np.ndarray  # float64 (worlds, cars, 3): ARC_LENGTH [m], OFFSET [m], HEADING_ERROR [rad]
@@ -47,13 +58,17 @@ class Worlds(NamedTuple):
     scan: np.ndarray  # float32 (worlds, cars, beams) [m]
 
 
-def allocate_worlds(worlds: int, cars: int, slots: int, beams: int) -> Worlds:
+def allocate_worlds(
+    worlds: int, cars: int, slots: int, beams: int, pose_slots: int = 1, road_bins: int = 0
+) -> Worlds:
     """Return the arrays of some worlds, all zeros.
 
     Args:
         worlds, cars: worlds, and cars in each.
         slots: physics steps for which commands are kept, this one included.
         beams: of a scan.
+        pose_slots: physics steps for which poses are kept, this one included.
+        road_bins: parts of the lap with a friction of their own.
     """
     each = (worlds, cars)
     return Worlds(
@@ -63,7 +78,10 @@ def allocate_worlds(worlds: int, cars: int, slots: int, beams: int) -> Worlds:
         tick=np.zeros(worlds, np.int64),
         params=np.zeros(each, PARAMETERS),
         state=np.zeros((*each, N_STATE), np.float32),
+        measured=np.zeros((*each, 5), np.float32),
+        road=np.ones((worlds, road_bins), np.float32),
         before=np.zeros((*each, 3), np.float32),
+        poses=np.zeros((*each, pose_slots, 3), np.float32),
         delayed=np.zeros((*each, slots, 2), np.float32),
         lagged=np.zeros((*each, 2), np.float32),
         frenet=np.zeros((*each, 3)),
