@@ -11,7 +11,7 @@ import pytest
 
 from outlap.envs.racing_line import LINE_SPEED, racing_lines
 from outlap.simulator.atlas import FIRST_ROW, LINE_SPACING, ROWS, build_atlas
-from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
+from outlap.simulator.vehicle import VehicleParams
 from outlap.track.centerline import Centerline
 from outlap.track.raceline import Raceline
 from outlap.track.track import Track
@@ -22,9 +22,7 @@ GRAVITY = 9.81
 def profile(*tracks: Track, **vehicle: Any) -> list[np.ndarray]:
     """The reference speeds of each track [m/s]."""
     atlas = build_atlas(tracks)
-    speeds = racing_lines(tracks, atlas, to_records(parameter_bounds(VehicleParams(**vehicle))[0]), "track")[
-        :, LINE_SPEED
-    ]
+    speeds = racing_lines(tracks, atlas, CarLimits.of(VehicleParams(**vehicle)), "track")[:, LINE_SPEED]
     assert speeds.shape == (len(atlas.line),)
     return [speeds[first : first + rows] for first, rows in atlas.index[:, [FIRST_ROW, ROWS]]]
 

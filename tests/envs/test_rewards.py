@@ -220,7 +220,7 @@ def test_the_reference_is_that_of_the_place_and_of_the_track():
     atlas = race.simulator.atlas
     for world, number in enumerate(race.worlds.track.tolist()):
         track, (first, rows) = tracks[number], atlas.index[number, [FIRST_ROW, ROWS]]
-        line = cached_line(track, CarLimits.of_record(race.worlds.params[world, 0]))
+        line = cached_line(track, CarLimits.of_record(race.worlds.params[world, 0], "single_track"))
         at, _ = track.centerline.to_frenet(*line.path.points.T)
         for row in range(0, rows, 40):
             everyone = np.full(8, atlas.index[race.worlds.track, FIRST_ROW])

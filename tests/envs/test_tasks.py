@@ -14,11 +14,14 @@ from outlap.envs.tasks import TaskSet, TaskSplit
 from outlap.errors import OutlapError
 from outlap.simulator.seeding import world_keys
 from outlap.simulator.vehicle import (
+    DERIVED,
     N_PARAMS,
     NAMES,
     ActuatorParams,
+    AxleTyres,
     LidarParams,
     PacejkaTyre,
+    SensorParams,
     VehicleParams,
     to_records,
     to_values,
@@ -29,18 +32,27 @@ from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN
 from outlap.track.map_io import write_track
 from outlap.track.track import Track
 
-PARTS = {"vehicle": VehicleParams, "tyre": PacejkaTyre, "actuators": ActuatorParams, "lidar": LidarParams}
-FIELDS = [(part, name) for part, cls in PARTS.items() for name in cls.model_fields if name != "tyre"]
+PARTS = {
+    "vehicle": VehicleParams,
+    "axles": AxleTyres,
+    "tyre": PacejkaTyre,
+    "actuators": ActuatorParams,
+    "sensors": SensorParams,
+    "lidar": LidarParams,
+}
+FIELDS = [(part, name) for part, cls in PARTS.items() for name in cls.model_fields if name not in ("axles", "tyre")]
 
 
 def test_there_is_a_field_for_every_column():
-    assert sorted(name for _, name in FIELDS) == sorted(set(NAMES) - {"kinematic_speed"})
+    assert sorted(name for _, name in FIELDS) == sorted(set(NAMES) - set(DERIVED))
 
 
 def with_range(part: str, name: str) -> tuple[dict, float, float]:
     """Configurations in which one parameter has a range around its default."""
     default = bounds(getattr(PARTS[part](), name))[0]
     low, high = sorted((0.8 * default, 1.1 * default)) if default else (0.001, 0.04)
+    if part == "axles":
+        return {"vehicle": VehicleParams(axles=AxleTyres(**{name: (low, high)}))}, low, high
     if part == "tyre":
         return {"vehicle": VehicleParams(tyre=PacejkaTyre(**{name: (low, high)}))}, low, high
     return {part: PARTS[part](**{name: (low, high)})}, low, high

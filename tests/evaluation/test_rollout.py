@@ -163,7 +163,7 @@ def test_drawn_parameters_name_the_right_columns():
         actuators=ActuatorParams(speed_lag=(0.0, 0.1)),
         lidar=LidarParams(dropout=(0.0, 0.2)),
     )
-    low, high = parameter_bounds(config.vehicle, config.actuators, config.lidar)
+    low, high = parameter_bounds(config.vehicle, config.actuators, config.lidar, config.sensors)
     ends = {name: (pytest.approx(low[at]), pytest.approx(high[at])) for name, at in drawn_parameters(config).items()}
     assert ends == {
         "vehicle_width": (0.25, 0.31),

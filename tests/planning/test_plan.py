@@ -24,7 +24,7 @@ from outlap.planning.limits import CarLimits
 from outlap.planning.line_cache import cached_line
 from outlap.planning.min_laps import min_laps
 from outlap.planning.plan import DEFAULT_MARGIN, METHODS, PlannedLine, plan_line
-from outlap.simulator.vehicle import VehicleParams
+from outlap.simulator.vehicle import VehicleParams, parameter_bounds
 from outlap.track import Track, load_track
 from outlap.track.centerline import Centerline
 from outlap.track.generate import generate_track
@@ -194,7 +194,7 @@ def test_ctrl_c_stops_the_solver_and_is_no_planning_error(circuit):
     code = (
         "import signal, threading, sys, os\n"
         "from outlap.planning import plan\nfrom outlap.planning.limits import CarLimits\n"
-        "from outlap.simulator.vehicle import VehicleParams\nfrom outlap.track.generate import generate_track\n"
+        "from outlap.simulator.vehicle import VehicleParams, parameter_bounds\nfrom outlap.track.generate import generate_track\n"
         "track = generate_track(11, length=300.0)\n"
         "plan.log.info = lambda *words: words[-1] == 1 and threading.Timer(1.0, os.kill, (os.getpid(), 2)).start()\n"
         "try:\n    plan.plan_line(track, CarLimits.of(VehicleParams()))\n"
@@ -238,13 +238,15 @@ def test_a_kept_line_is_the_same_and_a_broken_file_is_planned_anew(tmp_path, mon
 
 
 def test_the_yardstick_of_one_car_is_its_planned_lap(circuit):
-    table = min_laps(circuit, VehicleParams(v_max=8.0))
+    table = min_laps(circuit, parameter_bounds(VehicleParams(v_max=8.0)), "single_track")
     assert table.error == 0.0
     assert table.of([CAR])[0] == pytest.approx(cached_line(circuit, CAR).lap_time, rel=1e-9)
 
 
 def test_the_yardstick_of_a_car_that_is_drawn_is_the_lap_planned_for_it(circuit):
-    table = min_laps(circuit, VehicleParams(mu=(0.5, 1.1), a_max=(6.0, 12.0), v_max=8.0))
+    table = min_laps(
+        circuit, parameter_bounds(VehicleParams(mu=(0.5, 1.1), a_max=(6.0, 12.0), v_max=8.0)), "single_track"
+    )
     low, car, high = (replace(CAR, mu=mu, a_max=a, a_brake=a) for mu, a in ((0.5, 6.0), (0.62, 10.5), (1.1, 12.0)))
     own = plan_line(circuit, car).lap_time
     assert 0.0 <= table.error < 0.01

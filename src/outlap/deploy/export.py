@@ -54,6 +54,8 @@ def export_policy(run: Run, path: str | os.PathLike[str]) -> dict[str, Any]:
         import onnx
     except ImportError:
         raise OutlapError("onnx is not installed; pip install 'outlap[deploy]'") from None
+    if run.config.env.command != "speed":
+        raise OutlapError(f"{run.folder}: commands the {run.config.env.command}; a car takes speeds, train with speed")
     model = load_model(run.config, run.policy_path)
     observed = model.observation_space
     assert isinstance(observed, gym.spaces.Dict)

@@ -22,15 +22,17 @@ def speed_spans(params: np.ndarray, speed_range: tuple[float, float | None] | No
     return np.stack(np.broadcast_arrays(low, high, params["v_max"])[:2], -1).astype(np.float32)
 
 
-def commands(actions: np.ndarray, params: np.ndarray, speeds: np.ndarray) -> np.ndarray:
-    """Steering angles [rad] and speeds [m/s] of normalised actions.
+def commands(actions: np.ndarray, params: np.ndarray, speeds: np.ndarray, command: str = "speed") -> np.ndarray:
+    """Return the commands of normalised actions: steering angles [rad] and speeds [m/s] or shares of the largest force.
 
-    ±1 in the first column is the left / right stop, 0 is straight ahead; -1 … 1 in the second spans the car's speeds.
+    ±1 in the first column is the left / right stop, 0 is straight ahead; -1 … 1 in the second spans the car's speeds,
+    or full braking to full drive where `command` is `acceleration`.
 
     Args:
         actions: (..., 2) in [-1, 1]: steer (left positive), speed.
         params: PARAMETERS (...) of the cars.
         speeds: (..., 2) that -1 and 1 command [m/s].
+        command: see `SimulatorConfig.command`.
 
     Returns:
         float32 (..., 2).
@@ -38,6 +40,9 @@ def commands(actions: np.ndarray, params: np.ndarray, speeds: np.ndarray) -> np.
     steer, speed = actions[..., 0], actions[..., 1]
     out = np.empty(actions.shape, np.float32)
     out[..., 0] = np.where(steer >= 0.0, steer * params["steer_max"], -steer * params["steer_min"])
+    if command == "acceleration":
+        out[..., 1] = speed
+        return out
     out[..., 1] = speeds[..., 0] + 0.5 * (speed + 1.0) * (speeds[..., 1] - speeds[..., 0])
     return out
 

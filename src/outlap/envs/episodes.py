@@ -85,11 +85,12 @@ class Episodes:
         Args:
             outcome: how the last step ended each world's episode, str (worlds,).
         """
-        worlds, opponents = self._race.worlds, self._opponents
+        race, worlds, opponents = self._race, self._race.worlds, self._opponents
         info: dict[str, Any] = {
             "outcome": outcome,
             "track": self._track_names[worlds.track],
             "task": self._task.copy(),
+            "car": race.cars[:, EGO].copy(),
             "vehicle": to_values(worlds.params).copy(),
             "contact": CONTACTS[worlds.contact[:, EGO]],
             "opponents": opponents.names(),

@@ -15,12 +15,13 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
+from outlap.envs.car_sets import TRAINING_RANGES, scaled
 from outlap.envs.race import Race
 from outlap.envs.racing_line import LINE_SPEED, LINE_X, LINE_Y
 from outlap.errors import OutlapError
 from outlap.simulator import state as column
 from outlap.simulator.collision import REMOVED
-from outlap.simulator.worlds import HEADING_ERROR, OFFSET
+from outlap.simulator.worlds import FORWARD, HEADING_ERROR, LEFTWARD, OFFSET, SLIP, STEER, YAW_RATE
 
 INF = math.inf
 LINE_AHEAD = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)  # [m] along the centreline
@@ -50,15 +51,13 @@ def pose(race: Race, car: int) -> np.ndarray:
 
 
 def vel(race: Race, car: int) -> np.ndarray:
-    """Velocity forward and to the left [m/s] in the car's frame, yaw rate [rad/s]."""
-    state = race.worlds.state[:, car]
-    speed, slip = state[:, column.SPEED], state[:, column.SLIP]
-    return np.stack([speed * np.cos(slip), speed * np.sin(slip), state[:, column.YAW_RATE]], axis=1)
+    """Velocity forward and to the left [m/s] in the car's frame, yaw rate [rad/s]; as measured."""
+    return race.worlds.measured[:, car, [FORWARD, LEFTWARD, YAW_RATE]]
 
 
 def heading(race: Race, car: int) -> np.ndarray:
-    """Steering angle and slip angle [rad]."""
-    return race.worlds.state[:, car, [column.STEER, column.SLIP]]
+    """Steering angle and slip angle [rad]; as measured."""
+    return race.worlds.measured[:, car, [STEER, SLIP]]
 
 
 def previous_action(race: Race, car: int) -> np.ndarray:
@@ -69,6 +68,12 @@ def previous_action(race: Race, car: int) -> np.ndarray:
 def previous_reward(race: Race, car: int) -> np.ndarray:
     """The car's reward of the step before; 0 after a reset, and for opponents, whose rewards nobody counts."""
     return race.rewards[:, car, None]
+
+
+def vehicle(race: Race, car: int) -> np.ndarray:
+    """The parameters of TRAINING_RANGES, -1 … 1 within them. Privileged: no real car knows them."""
+    params = race.worlds.params[:, car]
+    return scaled(np.stack([params[name] for name in TRAINING_RANGES], axis=1))
 
 
 def frenet(race: Race, car: int) -> np.ndarray:
@@ -132,6 +137,7 @@ OBSERVATION_TERMS: dict[str, ObservationTerm] = {
     "heading": ObservationTerm(heading, low=(-math.pi,), high=(math.pi,), scale=(0.4, 0.4), size=2),
     "previous_action": ObservationTerm(previous_action, low=(-1.0,), high=(1.0,), scale=(1.0,), size=2),
     "previous_reward": ObservationTerm(previous_reward, low=(-INF,), high=(INF,), scale=(0.1,), size=1),
+    "vehicle": ObservationTerm(vehicle, low=(-INF,), high=(INF,), scale=(1.0,), size=len(TRAINING_RANGES)),
     "frenet": ObservationTerm(frenet, low=(-INF, -math.pi), high=(INF, math.pi), scale=(1.0, 1.0), size=2),
     "curvature_ahead": ObservationTerm(
         curvature_ahead, low=(-INF,), high=(INF,), scale=(0.5,), size=len(CURVATURE_AHEAD)

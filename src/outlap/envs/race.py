@@ -43,6 +43,7 @@ class Race:
     racing: np.ndarray = field(init=False)  # bool: on the track
     places_gained: np.ndarray = field(init=False)  # in this step
     places_lost: np.ndarray = field(init=False)
+    cars: np.ndarray = field(init=False)  # int64 (worlds, cars): number in the set of cars, or NO_CAR
     rewards: np.ndarray = field(init=False)  # of this step, 0 after a reset
 
     def __post_init__(self) -> None:
@@ -61,6 +62,7 @@ class Race:
         self.racing = np.ones(everyone, bool)
         self.places_gained = np.zeros(everyone, np.int64)
         self.places_lost = np.zeros(everyone, np.int64)
+        self.cars = np.full(everyone, -1, np.int64)
         self.rewards = np.zeros(everyone)
 
     @property
@@ -71,8 +73,12 @@ class Race:
     @property
     def length(self) -> np.ndarray:
         """Of each world's centreline: (worlds,) [m]."""
-        atlas, track = self.simulator.atlas, self.worlds.track
-        return atlas.index[track, ROWS] * atlas.frame[track, SPACING]
+        return self.track_lengths(self.worlds.track)
+
+    def track_lengths(self, tracks: np.ndarray) -> np.ndarray:
+        """The lengths of the centrelines of tracks (n,): (n,) [m]."""
+        atlas = self.simulator.atlas
+        return atlas.index[tracks, ROWS] * atlas.frame[tracks, SPACING]
 
     @property
     def distance(self) -> np.ndarray:
@@ -101,8 +107,9 @@ class Race:
         """Return a field of the centreline's table at distances ahead of a car [m]: (worlds, len(ahead))."""
         return self.simulator.atlas.line[name][self.line_rows(car, ahead)]
 
-    def begin(self, which: np.ndarray) -> None:
-        """Take note of worlds that were just reset."""
+    def begin(self, which: np.ndarray, cars: np.ndarray) -> None:
+        """Note that worlds were just reset, with cars of these numbers, (n, cars), see `tasks.Tasks`."""
+        self.cars[which] = cars
         if self.reference is not None:
             self.reference.begin(which, self.worlds.track[which], self.worlds.params[which])
         self.actions[which] = 0.0

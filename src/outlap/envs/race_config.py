@@ -10,11 +10,12 @@ from outlap.config import Number, bounded, bounds
 from outlap.envs.observations import OBSERVATION_TERMS
 from outlap.envs.racing_line import RacingLine
 from outlap.envs.rewards import RewardConfig
+from outlap.envs.road import RoadConfig
 from outlap.envs.starts import StartConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.envs.wrecks import CrashRule
 from outlap.simulator.simulator import SimulatorConfig
-from outlap.simulator.vehicle import PRESETS, ActuatorParams, LidarParams, VehicleParams
+from outlap.simulator.vehicle import PRESETS, ActuatorParams, LidarParams, SensorParams, VehicleParams
 
 PAPER_OBSERVATION = ("scan", "pose", "vel", "heading")
 
@@ -47,7 +48,10 @@ class RaceConfig(SimulatorConfig):
     speed_range: tuple[float, float | None] | None = None  # [m/s] commanded by -1, 1; None: v_min, v_max
     vehicle: Annotated[VehicleParams, BeforeValidator(_vehicle_preset)] = VehicleParams()
     actuators: ActuatorParams = ActuatorParams()
+    sensors: SensorParams = SensorParams()
     lidar: LidarParams = LidarParams()
+    cars: str = ""  # draw cars from this set, see envs.car_sets: training, outside:40, a csv file; none: as above
+    road: RoadConfig = RoadConfig()
     observation: tuple[str, ...] = PAPER_OBSERVATION  # terms, see envs.observations
     racing_line: RacingLine = "track"  # to which `line_ahead` leads, see envs.racing_line
     nearby_cars: int = Field(default=3, ge=1)  # of which the term of that name tells

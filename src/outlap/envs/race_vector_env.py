@@ -14,6 +14,7 @@ from outlap.config import bounds
 from outlap.drivers.driver import Driver
 from outlap.drivers.find import find_drivers
 from outlap.envs.actions import check_actions, commands, speed_spans
+from outlap.envs.car_sets import find_cars
 from outlap.envs.episode_seeds import EpisodeSeeds
 from outlap.envs.episodes import Episodes, final_info
 from outlap.envs.observations import observation_space, observe
@@ -22,13 +23,15 @@ from outlap.envs.race import EGO, RUNNING, Race
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.racing_line import ReferenceSpeeds, racing_lines
 from outlap.envs.rewards import weighted_terms
+from outlap.envs.road import draw_road
 from outlap.envs.starts import reset_worlds
 from outlap.envs.tasks import TaskSet
 from outlap.envs.terminations import outcomes
 from outlap.envs.wrecks import Wrecks
 from outlap.errors import OutlapError
+from outlap.planning.limits import CarLimits
 from outlap.simulator.simulator import Simulator
-from outlap.simulator.vehicle import parameter_bounds, to_records
+from outlap.simulator.vehicle import to_records
 from outlap.track.catalog import load_tracks
 from outlap.track.generate import BUILTIN_TRAIN
 from outlap.track.track import Track
@@ -83,7 +86,8 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
         drivers: Sequence[Driver] = ()
         if config.num_cars > 1:
             drivers = _drivers(config) if opponents is None else opponents
-        self.tasks = TaskSet(loaded, config.vehicle, config.actuators, config.lidar)
+        cars = find_cars(config.cars) if config.cars else None
+        self.tasks = TaskSet(loaded, config.vehicle, config.actuators, config.lidar, config.sensors, cars)
         self._weights = config.reward.resolved()
         self.race = _build_race(num_envs, config, self.tasks, drivers)
         self.opponents = Opponents(drivers, self.race, config.opponent_speed, config.opponent_noise)
@@ -169,7 +173,9 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
             raise OutlapError(f"world {np.argmax(self._over)}: its episode is over or never began; call reset first")
         race, config = self.race, self.config
         race.act(actions)
-        race.simulator.step(commands(race.actions, race.worlds.params, race.speeds), config.control_interval)
+        race.simulator.step(
+            commands(race.actions, race.worlds.params, race.speeds, config.command), config.control_interval
+        )
         race.advance(config.termination.stall_distance)
         race.training_steps += self.num_envs
         for car in self._learners:
@@ -188,12 +194,13 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
     def _begin(self, which: np.ndarray) -> None:
         """Draw a task and a start for some worlds, and reset them."""
         keys, episodes = self._seeds.next_episodes(which)
-        tracks, params = self.tasks.draw(keys, episodes, self.config.num_cars)
+        tracks, params, cars = self.tasks.draw(keys, episodes, self.config.num_cars)
         self.race.speeds[which] = speed_spans(params, self.config.speed_range)
         if self.opponents.drivers:
             self.race.speeds[which, 1:] = self.opponents.draw(which, keys, episodes, params[:, 1:])
-        reset_worlds(self.config.start, self.race.simulator, which, keys, episodes, tracks, params)
-        self.race.begin(which)
+        road = draw_road(self.config.road, keys, episodes, self.race.track_lengths(tracks))
+        reset_worlds(self.config.start, self.race.simulator, which, keys, episodes, tracks, params, road)
+        self.race.begin(which, cars)
         self._wrecks.begin(which)
         self._episodes.begin(which)
         self._over[which] = False
@@ -237,12 +244,14 @@ def _drivers(config: RaceConfig) -> list[Driver]:
 
 def _build_race(num_envs: int, config: RaceConfig, tasks: TaskSet, drivers: Sequence[Driver]) -> Race:
     """The race, with the lines that its observations and rewards need."""
-    simulator = Simulator(tasks.tracks, num_envs, config.num_cars, config, tasks.max_delay)
-    typical = to_records(np.mean(parameter_bounds(config.vehicle), axis=0))
+    simulator = Simulator(
+        tasks.tracks, num_envs, config.num_cars, config, tasks.max_delay, tasks.max_latency, config.road.bins
+    )
+    typical = CarLimits.of_record(to_records(np.mean(tasks.bounds, axis=0)), config.model)
     terms = {*config.observation, *(term for driver in drivers for term in driver.observation_terms)}
     choice = config.racing_line if "line_ahead" in terms else "track"
     line = racing_lines(tasks.tracks, simulator.atlas, typical, choice)
     reference = None
     if "velocity_matching" in config.reward.resolved():
-        reference = ReferenceSpeeds(tasks.tracks, simulator.atlas, typical, num_envs, config.num_cars)
+        reference = ReferenceSpeeds(tasks.tracks, simulator.atlas, typical, config.model, num_envs, config.num_cars)
     return Race(simulator, config.nearby_cars, line, reference)

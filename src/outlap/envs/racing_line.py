@@ -9,7 +9,7 @@ import numpy as np
 from outlap.planning.limits import CarLimits
 from outlap.planning.line_cache import cached_line
 from outlap.planning.path import ClosedPath
-from outlap.planning.speed_profile import speed_profile, speed_profiles
+from outlap.planning.speed_profile import motor, speed_profile, speed_profiles
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
 from outlap.track.track import Track
 
@@ -21,18 +21,18 @@ PROFILE_SPACING = 0.1  # [m] of the points at which a car's own speeds are found
 LINE_X, LINE_Y, LINE_SPEED = range(3)  # columns
 
 
-def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, choice: RacingLine) -> np.ndarray:
+def racing_lines(tracks: tuple[Track, ...], atlas: Atlas, limits: CarLimits, choice: RacingLine) -> np.ndarray:
     """The racing line beside every row of the atlas: float32 (rows, 3) x [m], y [m], speed [m/s].
 
     Points of a line are at the arc lengths of the centreline beside which they lie.
 
     Args:
-        params: a record of PARAMETERS, a typical car, for which lines are planned.
+        tracks, atlas: the tracks.
+        limits: of a typical car, for which lines are planned.
         choice: which line.
 
     Raises OutlapError for a track on which none can be planned.
     """
-    limits = CarLimits.of_record(params)
     out = np.empty((len(atlas.line), 3), np.float32)
     for number, track in enumerate(tracks):
         first, rows = int(atlas.index[number, FIRST_ROW]), int(atlas.index[number, ROWS])
@@ -56,17 +56,20 @@ class ReferenceSpeeds:
     The line is that of the typical car: with a car's own line its lap would be faster by a few parts in a thousand.
     """
 
-    def __init__(self, tracks: tuple[Track, ...], atlas: Atlas, params: np.ndarray, worlds: int, cars: int) -> None:
+    def __init__(
+        self, tracks: tuple[Track, ...], atlas: Atlas, limits: CarLimits, model: str, worlds: int, cars: int
+    ) -> None:
         """Plan a line on each track, or take it from those that are kept.
 
         Args:
             tracks, atlas: see `racing_lines`.
-            params: a record of PARAMETERS, a typical car.
+            limits: of a typical car.
+            model: of `SimulatorConfig`.
             worlds, cars: how many there are.
 
         Raises OutlapError for a track on which none can be planned.
         """
-        limits = CarLimits.of_record(params)
+        self._model = model
         self._lines = [cached_line(track, limits).path.resampled(PROFILE_SPACING) for track in tracks]
         rows = atlas.index[:, ROWS]
         self._beside = [
@@ -79,11 +82,13 @@ class ReferenceSpeeds:
     def begin(self, which: np.ndarray, track: np.ndarray, params: np.ndarray) -> None:
         """Take note of worlds (n,) that begin an episode, on tracks (n,), with cars PARAMETERS (n, cars)."""
         cars = params.shape[1]
-        motors = np.stack([params[name] for name in ("a_max", "a_max", "v_max", "v_switch")], axis=-1)
+        limits = [[CarLimits.of_record(record, self._model) for record in row] for row in params]
+        motors = np.array([[motor(car) for car in row] for row in limits])
+        grip = np.array([[car.mu for car in row] for row in limits])
         for number in map(int, np.unique(track)):
             here = np.flatnonzero(track == number)
             line, beside = self._lines[number], self._beside[number]
-            mu = params["mu"][here].reshape(-1, 1)
+            mu = grip[here].reshape(-1, 1)
             speeds = speed_profiles(line.curvature, line.spacing, motors[here].reshape(-1, 4), mu)
             self._speed[which[here], :, : len(beside)] = speeds[:, beside].reshape(len(here), cars, -1)
 

@@ -43,6 +43,7 @@ def reset_worlds(
     episodes: np.ndarray,
     tracks: np.ndarray,
     params: np.ndarray,
+    road: np.ndarray | None = None,
 ) -> None:
     """Reset some worlds to starts at which no car touches anything; redraw those of a world until there is none.
 
@@ -54,6 +55,7 @@ def reset_worlds(
         episodes: (n,) number of each world's episode.
         tracks: (n,) numbers in the atlas.
         params: of the cars, (n, cars).
+        road: friction along the lap, see `Simulator.reset`.
 
     Raises OutlapError for a track on which no such start is found.
     """
@@ -65,8 +67,9 @@ def reset_worlds(
         draws = episodes[waiting] * START_ATTEMPTS + attempt
         starts = draw_starts(config, simulator.atlas, keys[waiting], draws, tracks[waiting], params[waiting], spread)
         simulator.reset(
-            which[waiting], keys=noise_keys[waiting], tracks=tracks[waiting], params=params[waiting], starts=starts
-        )
+            which[waiting], keys=noise_keys[waiting], tracks=tracks[waiting], params=params[waiting], starts=starts,
+            road=None if road is None else road[waiting],
+        )  # fmt: skip
         waiting = waiting[(simulator.worlds.contact[which[waiting]] != FREE).any(axis=1)]
         if not len(waiting):
             return

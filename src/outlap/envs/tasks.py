@@ -4,30 +4,45 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
+from outlap.envs.car_sets import CarSet
 from outlap.errors import OutlapError
-from outlap.simulator.seeding import PARAMETER_STREAM, TRACK_STREAM, uniform
+from outlap.simulator.seeding import CAR_STREAM, PARAMETER_STREAM, TRACK_STREAM, uniform
 from outlap.simulator.vehicle import (
     N_PARAMS,
     ActuatorParams,
     LidarParams,
+    SensorParams,
     VehicleParams,
     parameter_bounds,
     to_records,
 )
 from outlap.track.track import Track
 
+NO_CAR = -1  # the number of a car that is drawn from ranges
+
+
+class Tasks(NamedTuple):
+    """Tasks that were drawn for n worlds."""
+
+    tracks: np.ndarray  # int64 (n,) positions in `TaskSet.tracks`
+    params: np.ndarray  # PARAMETERS (n, cars)
+    cars: np.ndarray  # int64 (n, cars) positions in the list of cars; NO_CAR without a list
+
 
 @dataclass(frozen=True, eq=False)
 class TaskSet:
-    """A distribution of tasks: tracks, each as likely as the others, × a range of every parameter."""
+    """A distribution of tasks: tracks, each as likely as the others, × cars, from ranges or from a list."""
 
     tracks: tuple[Track, ...]
     vehicle: VehicleParams = field(default_factory=VehicleParams)
     actuators: ActuatorParams = field(default_factory=ActuatorParams)
     lidar: LidarParams = field(default_factory=LidarParams)
+    sensors: SensorParams = field(default_factory=SensorParams)
+    cars: CarSet | None = None  # in place of the values above
 
     def __post_init__(self) -> None:
         if not self.tracks:
@@ -36,31 +51,40 @@ class TaskSet:
     @property
     def max_delay(self) -> float:
         """The longest actuator delay that a task can have [s]."""
-        high = to_records(self._bounds[1])
+        high = to_records(self.bounds[1])
         return float(max(high["steer_delay"], high["speed_delay"]))
 
-    @cached_property
-    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return parameter_bounds(self.vehicle, self.actuators, self.lidar)
+    @property
+    def max_latency(self) -> float:
+        """The longest latency of a scan that a task can have [s]."""
+        return float(to_records(self.bounds[1])["latency"])
 
-    def draw(self, keys: np.ndarray, episodes: np.ndarray, num_cars: int) -> tuple[np.ndarray, np.ndarray]:
-        """The tasks of some worlds' next episodes; every car's parameters are drawn on their own.
+    @cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """The smallest and the largest value of each parameter of a car: float32 (N_PARAMS,) each."""
+        low, high = parameter_bounds(self.vehicle, self.actuators, self.lidar, self.sensors)
+        if self.cars is not None:
+            low[self.cars.columns], high[self.cars.columns] = self.cars.bounds
+        return low, high
+
+    def draw(self, keys: np.ndarray, episodes: np.ndarray, num_cars: int) -> Tasks:
+        """Return the tasks of some worlds' next episodes; every car is drawn on its own.
 
         Args:
             keys: uint64 (n,) of the worlds, from `seeding.world_keys`.
             episodes: (n,) number of each world's episode.
             num_cars: cars a world.
-
-        Returns:
-            tracks: int64 (n,) positions in `tracks`.
-            params: PARAMETERS (n, num_cars).
         """
         choice = uniform(keys, episodes, TRACK_STREAM, 1)[:, 0]
-        low, high = self._bounds
+        low, high = self.bounds
         share = uniform(keys, episodes, PARAMETER_STREAM, num_cars * N_PARAMS)
         share = share.reshape(len(keys), num_cars, N_PARAMS)
-        values = (low + share * (high - low)).astype(np.float32)
-        return (choice * len(self.tracks)).astype(np.int64), to_records(np.clip(values, low, high))
+        values = np.clip((low + share * (high - low)).astype(np.float32), low, high)
+        cars = np.full((len(keys), num_cars), NO_CAR, np.int64)
+        if self.cars is not None and self.cars.listed:
+            cars = (uniform(keys, episodes, CAR_STREAM, num_cars) * self.cars.size).astype(np.int64)
+            values[..., self.cars.columns] = self.cars.values[cars]
+        return Tasks((choice * len(self.tracks)).astype(np.int64), to_records(values), cars)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from outlap.drivers.driver import Driver
 from outlap.drivers.find import find_drivers
+from outlap.envs.car_sets import find_cars
 from outlap.envs.observations import check_terms
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
@@ -111,7 +112,16 @@ def single_race(driver: Driver, config: RaceConfig, track: Track) -> RaceVectorE
     return env
 
 
+def parameter_ends(config: RaceConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest value of each parameter of a task's cars: (N_PARAMS,) each."""
+    low, high = parameter_bounds(config.vehicle, config.actuators, config.lidar, config.sensors)
+    if config.cars:
+        cars = find_cars(config.cars)
+        low[cars.columns], high[cars.columns] = cars.bounds
+    return low, high
+
+
 def drawn_parameters(config: RaceConfig) -> dict[str, int]:
-    """Those of a car's parameters that are ranges: the name of each in a row, and its `vehicle` column."""
-    low, high = parameter_bounds(config.vehicle, config.actuators, config.lidar)
+    """Return those of a car's parameters that differ between cars: the name of each in a row, its `vehicle` column."""
+    low, high = parameter_ends(config)
     return {name: column for column, name in enumerate(parameter_names()) if low[column] < high[column]}

@@ -24,7 +24,7 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import CURRICULA_OVER, RewardConfig, weighted_terms
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
-from outlap.evaluation.protocol import drawn_parameters, episode_seeds, episode_task
+from outlap.evaluation.protocol import drawn_parameters, episode_seeds, episode_task, parameter_ends
 from outlap.planning.limits import CarLimits
 from outlap.planning.min_laps import min_laps
 from outlap.simulator.vehicle import to_records
@@ -195,6 +195,7 @@ class _Races:
             **_row(info, world),
             **end,
             "start_m": float(self.start[world] % self.track.centerline.length),
+            **({"car": int(info["car"][world])} if self.config.cars else {}),
             **{name: float(vehicle[column]) for name, column in self.drawn.items()},
             **{f"opponent_{i}": str(info["opponents"][world, i - 1]) for i in opponents},
             **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in drawn_speeds},
@@ -211,12 +212,14 @@ def _with_lap_time_ratios(
     lapped = np.array([row["completed_laps"] > 0 for row in rows])
     if wanted and lapped.any():
         try:
-            table = min_laps(track, config.vehicle)
+            table = min_laps(track, parameter_ends(config), config.model)
         except OutlapError as problem:  # of the yardstick alone: what was raced is worth no less
             log.warning("no lap_time_ratio: %s", problem)
         else:
             cars = [
-                CarLimits.of_record(to_records(vehicle)) for vehicle, lap in zip(vehicles, lapped, strict=True) if lap
+                CarLimits.of_record(to_records(vehicle), config.model)
+                for vehicle, lap in zip(vehicles, lapped, strict=True)
+                if lap
             ]
             least[lapped], error[lapped] = table.of(cars), table.error
     for row, seconds, part in zip(rows, least.tolist(), error.tolist(), strict=True):

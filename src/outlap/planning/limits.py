@@ -46,12 +46,25 @@ class CarLimits:
         return self.mu * GRAVITY
 
     @classmethod
-    def of_record(cls, record: np.ndarray) -> CarLimits:
-        """Return the limits of a car, a record of `simulator.vehicle.PARAMETERS`."""
+    def of_record(cls, record: np.ndarray, model: str) -> CarLimits:
+        """Return the limits of a car under a vehicle model.
+
+        Args:
+            record: of `simulator.vehicle.PARAMETERS`.
+            model: of `SimulatorConfig`. Under `nonlinear_single_track`, accelerations follow from forces and mass, and
+                the axle with less friction limits the grip.
+        """
         values = {name: float(record[name]) for name in NAMES}
         wheelbase = values["lf"] + values["lr"]
         lock = min(values["steer_max"], -values["steer_min"])
         values |= {"a_brake": values["a_max"], "max_curvature": math.tan(lock) / wheelbase, "wheelbase": wheelbase}
+        if model == "nonlinear_single_track":
+            values |= {
+                "mu": values["mu"] * min(values["front_peak"], values["rear_peak"]),
+                "a_max": values["motor_force"] / values["m"],
+                "a_brake": values["brake_force"] / values["m"],
+                "v_switch": values["motor_power"] / values["motor_force"],
+            }
         values = {field.name: values[field.name] for field in fields(cls)}
         return cls(**{name: float(f"{value:.6g}") for name, value in values.items()})
 
@@ -67,6 +80,6 @@ class CarLimits:
         )
 
     @classmethod
-    def of(cls, params: VehicleParams) -> CarLimits:
-        """Of a car; of the middle of every range."""
-        return cls.of_record(to_records(np.mean(parameter_bounds(params), axis=0)))
+    def of(cls, params: VehicleParams, model: str = "single_track") -> CarLimits:
+        """Return the limits of a car, or of the middle of every range, under a vehicle model."""
+        return cls.of_record(to_records(np.mean(parameter_bounds(params), axis=0)), model)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -15,10 +16,10 @@ from outlap.planning.line_cache import cached, cached_line, path_arrays, path_of
 from outlap.planning.path import ClosedPath
 from outlap.planning.plan import DEFAULT_MARGIN, SPACING, plan_line
 from outlap.planning.speed_profile import lap_time, motor, speed_profiles
-from outlap.simulator.vehicle import VehicleParams, parameter_bounds, to_records
+from outlap.simulator.vehicle import to_records
 from outlap.track.track import Track
 
-DRAWN = ("mu", "a_max", "v_max", "v_switch")  # what counts where it is drawn; of the rest, the middle does
+DRAWN = ("mu", "a_max", "a_brake", "v_max", "v_switch")  # what counts where it is drawn; of the rest, the middle does
 CHECKS = 2  # cars for which a table is compared with a line of their own
 
 log = logging.getLogger(__name__)
@@ -47,15 +48,20 @@ class MinLaps:
         return np.min(times, axis=0)
 
 
-def min_laps(track: Track, vehicle: VehicleParams) -> MinLaps:
-    """The table of a track for all cars in the ranges of a vehicle; kept on disk.
+def min_laps(track: Track, ends: tuple[np.ndarray, np.ndarray], model: str) -> MinLaps:
+    """Return the table of a track for all cars in a range; it is kept on disk.
 
     Of what is neither friction nor motor (size, wheelbase, steering) the middle counts.
 
+    Args:
+        track: to lap.
+        ends: the smallest and the largest value of each parameter of a car, (N_PARAMS,) each.
+        model: of `SimulatorConfig`.
+
     Raises OutlapError where no line can be planned for the middle of the ranges.
     """
-    low, high = (CarLimits.of_record(to_records(values)) for values in parameter_bounds(vehicle))
-    middle = CarLimits.of(vehicle)
+    low, high = _extremes(ends, model)
+    middle = CarLimits.of_record(to_records(np.mean(ends, axis=0)), model)
 
     def plan() -> dict[str, np.ndarray]:
         table = _table(track, low, middle, high)
@@ -69,9 +75,29 @@ def min_laps(track: Track, vehicle: VehicleParams) -> MinLaps:
     return MinLaps(lines, float(saved["error"]))
 
 
+def _extremes(ends: tuple[np.ndarray, np.ndarray], model: str) -> tuple[CarLimits, CarLimits]:
+    """The smallest and the largest value of each limit; a ratio of two parameters is smallest at opposite ends."""
+    low, high = (to_records(np.array(values)) for values in ends)
+    corners: list[CarLimits] = []
+    for force, mass, power in itertools.product((low, high), repeat=3):
+        record = low.copy()
+        record["motor_force"], record["brake_force"] = force["motor_force"], force["brake_force"]
+        record["m"], record["motor_power"] = mass["m"], power["motor_power"]
+        corners.append(CarLimits.of_record(record, model))
+    extremes: list[CarLimits] = []
+    for record, chosen in ((low, min), (high, max)):
+        ratios = {name: chosen(getattr(each, name) for each in corners) for name in ("a_max", "a_brake", "v_switch")}
+        limits = CarLimits.of_record(record, model)
+        extremes.append(replace(limits, **ratios) if model == "nonlinear_single_track" else limits)
+    return extremes[0], extremes[1]
+
+
 def _table(track: Track, low: CarLimits, middle: CarLimits, high: CarLimits) -> MinLaps:
     line = cached_line(track, middle).path
     drawn = [name for name in DRAWN if getattr(low, name) < getattr(high, name)]
+    tied = (low.a_max, high.a_max) == (low.a_brake, high.a_brake)  # brakes and motor are drawn as one
+    if tied and "a_brake" in drawn:
+        drawn.remove("a_brake")
     if not drawn:
         return MinLaps((line,), 0.0)
     log.info("%s: planning %d more lines for the cars that are drawn", track.name, 2 * len(drawn) + CHECKS)
@@ -79,7 +105,9 @@ def _table(track: Track, low: CarLimits, middle: CarLimits, high: CarLimits) -> 
     def car(shares: Mapping[str, float]) -> CarLimits:
         """Of the middle, but for what is this share of the way from low to high."""
         values = {name: (1.0 - x) * getattr(low, name) + x * getattr(high, name) for name, x in shares.items()}
-        return replace(middle, **values, a_brake=values.get("a_max", middle.a_brake))
+        if tied and "a_max" in values:
+            values["a_brake"] = values["a_max"]
+        return replace(middle, **values)
 
     table = MinLaps((line, *_lines_about(line, track, [car({name: x}) for name in drawn for x in (0.0, 1.0)])), 0.0)
     checks = [car(dict(zip(drawn, x, strict=True))) for x in np.random.default_rng(0).random((CHECKS, len(drawn)))]

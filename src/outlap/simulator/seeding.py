@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 # Purposes: numbers drawn for one never depend on how many another draws.
-TRACK_STREAM, PARAMETER_STREAM, START_STREAM, DRIVER_STREAM, NOISE_STREAM = range(5)
+TRACK_STREAM, PARAMETER_STREAM, START_STREAM, DRIVER_STREAM, NOISE_STREAM, CAR_STREAM, ROAD_STREAM = range(7)
 
 
 def world_keys(seeds: Sequence[int]) -> np.ndarray:

@@ -58,9 +58,7 @@ class Worlds(NamedTuple):
     scan: np.ndarray  # float32 (worlds, cars, beams) [m]
 
 
-def allocate_worlds(
-    worlds: int, cars: int, slots: int, beams: int, pose_slots: int = 1, road_bins: int = 0
-) -> Worlds:
+def allocate_worlds(worlds: int, cars: int, slots: int, beams: int, pose_slots: int = 1, road_bins: int = 0) -> Worlds:
     """Return the arrays of some worlds, all zeros.
 
     Args:

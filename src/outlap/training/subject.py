@@ -132,5 +132,5 @@ def find_limits(vehicle: str, track: Track, **changes: float | None) -> CarLimit
             raise OutlapError(f"--vehicle is 'track'; {track.name} has no raceline that could ask anything")
         limits = CarLimits.of(VehicleParams()).implied_by(track.raceline)
     else:
-        limits = CarLimits.of(find_vehicle(vehicle))
+        limits = CarLimits.of(find_vehicle(vehicle), "nonlinear_single_track")
     return replace(limits, **{name: value for name, value in changes.items() if value is not None})
