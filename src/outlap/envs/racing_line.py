@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from outlap.planning.limits import CarLimits
+from outlap.planning.limits import CarLimits, grip_and_motor
 from outlap.planning.line_cache import cached_line
 from outlap.planning.path import ClosedPath
-from outlap.planning.speed_profile import motor, speed_profile, speed_profiles
+from outlap.planning.speed_profile import speed_profile, speed_profiles
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING, Atlas
 from outlap.track.track import Track
 
@@ -82,13 +82,12 @@ class ReferenceSpeeds:
     def begin(self, which: np.ndarray, track: np.ndarray, params: np.ndarray) -> None:
         """Take note of worlds (n,) that begin an episode, on tracks (n,), with cars PARAMETERS (n, cars)."""
         cars = params.shape[1]
-        limits = [[CarLimits.of_record(record, self._model) for record in row] for row in params]
-        motors = np.array([[motor(car) for car in row] for row in limits])
-        grip = np.array([[car.mu for car in row] for row in limits])
+        limits = grip_and_motor(params, self._model)
+        motors = np.stack([limits["a_max"], limits["a_brake"], params["v_max"], limits["v_switch"]], axis=-1)
         for number in map(int, np.unique(track)):
             here = np.flatnonzero(track == number)
             line, beside = self._lines[number], self._beside[number]
-            mu = grip[here].reshape(-1, 1)
+            mu = limits["mu"][here].reshape(-1, 1)
             speeds = speed_profiles(line.curvature, line.spacing, motors[here].reshape(-1, 4), mu)
             self._speed[which[here], :, : len(beside)] = speeds[:, beside].reshape(len(here), cars, -1)
 

@@ -51,20 +51,13 @@ class CarLimits:
 
         Args:
             record: of `simulator.vehicle.PARAMETERS`.
-            model: of `SimulatorConfig`. Under `nonlinear_single_track`, accelerations follow from forces and mass, and
-                the axle with less friction limits the grip.
+            model: see `grip_and_motor`.
         """
         values = {name: float(record[name]) for name in NAMES}
         wheelbase = values["lf"] + values["lr"]
         lock = min(values["steer_max"], -values["steer_min"])
-        values |= {"a_brake": values["a_max"], "max_curvature": math.tan(lock) / wheelbase, "wheelbase": wheelbase}
-        if model == "nonlinear_single_track":
-            values |= {
-                "mu": values["mu"] * min(values["front_peak"], values["rear_peak"]),
-                "a_max": values["motor_force"] / values["m"],
-                "a_brake": values["brake_force"] / values["m"],
-                "v_switch": values["motor_power"] / values["motor_force"],
-            }
+        values |= {"max_curvature": math.tan(lock) / wheelbase, "wheelbase": wheelbase}
+        values |= {name: float(value) for name, value in grip_and_motor(record, model).items()}
         values = {field.name: values[field.name] for field in fields(cls)}
         return cls(**{name: float(f"{value:.6g}") for name, value in values.items()})
 
@@ -83,3 +76,23 @@ class CarLimits:
     def of(cls, params: VehicleParams, model: str = "single_track") -> CarLimits:
         """Return the limits of a car, or of the middle of every range, under a vehicle model."""
         return cls.of_record(to_records(np.mean(parameter_bounds(params), axis=0)), model)
+
+
+def grip_and_motor(params: np.ndarray, model: str) -> dict[str, np.ndarray]:
+    """Return the limits of cars that depend on the vehicle model: `mu`, `a_max`, `a_brake` and `v_switch`, (...) each.
+
+    Args:
+        params: records of `simulator.vehicle.PARAMETERS`, (...).
+        model: of `SimulatorConfig`. Under `nonlinear_single_track`, accelerations follow from forces and mass, and the
+            axle with less friction limits the grip.
+    """
+    names = ("mu", "a_max", "v_switch", "front_peak", "rear_peak", "motor_force", "brake_force", "motor_power", "m")
+    value = {name: np.asarray(params[name], np.float64) for name in names}
+    if model != "nonlinear_single_track":
+        return {"mu": value["mu"], "a_max": value["a_max"], "a_brake": value["a_max"], "v_switch": value["v_switch"]}
+    return {
+        "mu": value["mu"] * np.minimum(value["front_peak"], value["rear_peak"]),
+        "a_max": value["motor_force"] / value["m"],
+        "a_brake": value["brake_force"] / value["m"],
+        "v_switch": value["motor_power"] / value["motor_force"],
+    }
