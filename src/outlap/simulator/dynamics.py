@@ -63,12 +63,13 @@ HIGHEST_WHEEL_SPEED = 1.2  # times v_max / wheel_radius: the motor's limit under
 
 @njit(cache=True, error_model="numpy")
 def derive(model, integrator, dt, p):
-    """Set what a model needs of a car's parameters beforehand: `kinematic_speed`, `front_scale`, `rear_scale`.
+    """Set what a model needs of a car's parameters beforehand: those of `vehicle.DERIVED`.
 
     Args:
         model, integrator, dt: as for `integrate`.
         p: the car's parameters, changed in place.
     """
+    p.road_friction = 1.0
     p.front_scale = axle_scale(p.front_B, p.front_C, p.front_E)
     p.rear_scale = axle_scale(p.rear_B, p.rear_C, p.rear_E)
     front_slope, rear_slope = p.mu * p.C_Sf, p.mu * p.C_Sr
@@ -99,8 +100,8 @@ def integrate(model, integrator, state, steer_rate, acceleration, dt, p):
 
     Returns:
         The next state: yaw and slip in (-pi, pi]. Where tyres slip, yaw rate is within 50 rad/s; under SINGLE_TRACK
-        and NONLINEAR_SINGLE_TRACK slip is within pi / 2, under DRIFT speed within 1.2 times v_min … v_max. Whatever the car and the driver, the
-        state stays finite.
+        and NONLINEAR_SINGLE_TRACK slip is within pi / 2, under DRIFT speed within 1.2 times v_min … v_max. Whatever the
+        car and the driver, the state stays finite.
     """
     if model == DRIFT:
         return _substepped_drift(integrator, state, steer_rate, acceleration, dt, p)

@@ -190,8 +190,9 @@ class LidarParams(Config):
 PRESETS: dict[str, VehicleParams] = {
     "f1tenth": VehicleParams(),
     "paper": VehicleParams(mu=0.8, a_max=6.34, v_min=-8.0, v_max=8.0, motor_force=23.71, motor_power=173.5),
-    # Identified on a real car by the ForzaETH race stack (Baumann et al., 2024): B, C, D, E front 5.5405, 0.4182, 1.8635,
-    # 0.3722, rear 6.6014, 0.5624, 1.7327, 1.0648. D sin(C arctan(...)) peaks at 1.0335 in front and 0.8024 behind.
+    # Identified on a real car by the ForzaETH race stack (Baumann et al., 2024): B, C, D, E front 5.5405, 0.4182,
+    # 1.8635, 0.3722, rear 6.6014, 0.5624, 1.7327, 1.0648. D sin(C arctan(...)) peaks at 1.0335 in front and at 0.8024
+    # behind.
     "forzaeth": VehicleParams(
         mu=1.0335, m=3.54, I=0.05797, lf=0.162, lr=0.145, h=0.014, v_max=10.0,
         axles=AxleTyres(
