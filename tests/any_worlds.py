@@ -15,8 +15,10 @@ from pydantic import ValidationError
 from outlap.config import Config
 from outlap.simulator.vehicle import (
     ActuatorParams,
+    AxleTyres,
     LidarParams,
     PacejkaTyre,
+    SensorParams,
     VehicleParams,
     parameter_bounds,
     to_records,
@@ -29,12 +31,14 @@ from synthetic_tracks import ring, yard
 
 PARTS: dict[str, type[Config]] = {
     "vehicle": VehicleParams,
+    "axles": AxleTyres,
     "tyre": PacejkaTyre,
     "actuators": ActuatorParams,
+    "sensors": SensorParams,
     "lidar": LidarParams,
 }
-FIELDS = [(part, name) for part, cls in PARTS.items() for name in cls.model_fields if name != "tyre"]
-LONGEST_DELAY = 0.05  # [s] so that the buffers of the tests stay small
+FIELDS = [(part, name) for part, cls in PARTS.items() for name in cls.model_fields if name not in ("axles", "tyre")]
+LONGEST_DELAY = 0.05  # [s] of commands and scans, so that the buffers of the tests stay small
 
 shares = st.floats(0.0, 1.0) | st.sampled_from([0.0, 1.0])
 # Which fields differ from the default, and where in the accepted range they lie: few, or all of them.
@@ -81,7 +85,7 @@ def _ranked(rank: int) -> float:
 def value_at(part: str, name: str, share: float) -> float:
     """A value of a field's accepted range: 0 is its low end, 1 its high one; even over the orders of magnitude."""
     low, high = accepted(part, name)
-    if name.endswith("_delay"):
+    if name.endswith("_delay") or name == "latency":
         high = LONGEST_DELAY
     if share in (0.0, 1.0):
         return high if share else low
@@ -96,12 +100,11 @@ def value_at(part: str, name: str, share: float) -> float:
 
 
 def car_config(odd: dict[tuple[str, str], Any]) -> dict[str, Any]:
-    """The keywords `vehicle`, `actuators` and `lidar` of an environment, from values by (part, field)."""
+    """The keywords `vehicle`, `actuators`, `sensors` and `lidar` of an environment, from values by (part, field)."""
     fields: dict[str, dict[str, Any]] = {part: {} for part in PARTS}
     for (part, name), value in odd.items():
         fields[part][name] = value
-    tyre = fields.pop("tyre")
-    fields["vehicle"]["tyre"] = tyre
+    fields["vehicle"] |= {"axles": fields.pop("axles"), "tyre": fields.pop("tyre")}
     return fields
 
 
@@ -113,6 +116,7 @@ def rows(draw: st.DrawFn) -> np.ndarray:
         VehicleParams.model_validate(config["vehicle"]),
         ActuatorParams.model_validate(config["actuators"]),
         LidarParams.model_validate(config["lidar"]),
+        SensorParams.model_validate(config["sensors"]),
     )
     return to_records(values)
 

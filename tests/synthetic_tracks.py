@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike
 
 from outlap.simulator.simulator import Simulator, SimulatorConfig
 from outlap.simulator.state import YAW, X, Y
-from outlap.simulator.vehicle import N_PARAMS, VehicleParams, parameter_bounds, to_records, to_values
+from outlap.simulator.vehicle import (
+    N_PARAMS,
+    VehicleParams,
+    accepted_bounds,
+    parameter_bounds,
+    to_records,
+    to_values,
+)
 from outlap.simulator.worlds import Worlds
 from outlap.track.centerline import Centerline
 from outlap.track.track import Track
@@ -131,7 +138,7 @@ def place(
 def random_cars(rng: np.random.Generator, worlds: int, cars: int) -> np.ndarray:
     """Parameters within 30 % of the F1TENTH car's."""
     values = to_values(CAR) * rng.uniform(0.7, 1.3, (worlds, cars, N_PARAMS))
-    return to_records(values)
+    return to_records(np.clip(values, *accepted_bounds()))
 
 
 def random_commands(rng: np.random.Generator, params: np.ndarray) -> np.ndarray:

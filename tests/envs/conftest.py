@@ -59,7 +59,7 @@ def put() -> Callable[..., None]:
             starts=np.broadcast_to(starts, (env.num_envs, env.config.num_cars, 4)),
         )
         assert not worlds.contact.any(), "the test puts a car where it touches something"
-        env.race.begin(everyone)
+        env.race.begin(everyone, env.race.cars.copy())
 
     return begin
 

@@ -194,7 +194,7 @@ def test_scaling_divides_by_the_declared_constants(ellipse):
         a, b = plain.step(action)[0], scaled.step(action)[0]
     scales = {
         "scan": 10.0, "pose": [50.0, 50.0, math.pi], "vel": [10.0, 2.0, 5.0], "heading": 0.4, "previous_action": 1.0,
-        "previous_reward": 0.1, "frenet": 1.0, "curvature_ahead": 0.5,
+        "previous_reward": 0.1, "vehicle": 1.0, "frenet": 1.0, "curvature_ahead": 0.5,
         "line_ahead": [5.0, 5.0, 10.0] * len(LINE_AHEAD), "action_span": [0.4, 10.0, 10.0],
         "nearby_cars": [1.0, 5.0, 5.0, 1.0, 5.0] * 3,
     }  # fmt: skip

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from outlap.envs.racing_line import LINE_SPEED, racing_lines
+from outlap.planning.limits import CarLimits
 from outlap.simulator.atlas import FIRST_ROW, LINE_SPACING, ROWS, build_atlas
 from outlap.simulator.vehicle import VehicleParams
 from outlap.track.centerline import Centerline

@@ -194,7 +194,7 @@ def test_ctrl_c_stops_the_solver_and_is_no_planning_error(circuit):
     code = (
         "import signal, threading, sys, os\n"
         "from outlap.planning import plan\nfrom outlap.planning.limits import CarLimits\n"
-        "from outlap.simulator.vehicle import VehicleParams, parameter_bounds\nfrom outlap.track.generate import generate_track\n"
+        "from outlap.simulator.vehicle import VehicleParams\nfrom outlap.track.generate import generate_track\n"
         "track = generate_track(11, length=300.0)\n"
         "plan.log.info = lambda *words: words[-1] == 1 and threading.Timer(1.0, os.kill, (os.getpid(), 2)).start()\n"
         "try:\n    plan.plan_line(track, CarLimits.of(VehicleParams()))\n"

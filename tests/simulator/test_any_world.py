@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from any_worlds import campaign, circuits, rows
+from any_worlds import LONGEST_DELAY, campaign, circuits, rows
 from outlap.simulator.collision import FREE
 from outlap.simulator.dynamics import HIGHEST_YAW_RATE
 from outlap.simulator.simulator import MODELS, Simulator, SimulatorConfig
@@ -53,7 +53,7 @@ def test_every_car_stays_finite_within_its_limits_and_inside_the_walls(model):
             model=model, integrator=draw(st.sampled_from(["euler", "rk4"])),
             timestep=draw(st.sampled_from([0.01, 0.001, 0.1])), substeps=draw(st.integers(1, 3)), beams=9,
         )  # fmt: skip
-        sim = Simulator(tracks, 1, cars, config, max_delay=0.05)
+        sim = Simulator(tracks, 1, cars, config, max_delay=LONGEST_DELAY, max_latency=LONGEST_DELAY)
         sim.reset(
             np.arange(1), keys=np.arange(1, dtype=np.uint64), tracks=np.array([number]), params=params[None],
             starts=np.array([begin]),

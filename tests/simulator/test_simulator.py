@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from oracles import DelayAndLag
-from outlap.simulator.actuators import acceleration, steering_rate
+from outlap.simulator.actuators import acceleration, motor_force, steering_rate
 from outlap.simulator.dynamics import integrate
+from outlap.simulator.elementary import cosine_wide
 from outlap.simulator.simulator import INTEGRATORS, MODELS, Simulator, SimulatorConfig
-from outlap.simulator.state import N_STATE, SPEED, STEER, WHEEL_SPEED_FRONT, WHEEL_SPEED_REAR, YAW, X, Y
-from outlap.simulator.vehicle import to_values
+from outlap.simulator.state import N_STATE, SLIP, SPEED, STEER, WHEEL_SPEED_FRONT, WHEEL_SPEED_REAR, YAW, X, Y
+from outlap.simulator.vehicle import DERIVED, to_values
 from synthetic_tracks import CAR, random_cars, random_commands, ring, yard
 
 # Against a plain loop
@@ -30,8 +31,12 @@ def drive_alone(config: SimulatorConfig, params: np.void, state: np.ndarray, com
         steer_target, speed_target = steer_channel(float(steer)), speed_channel(float(speed))
         now = tuple(float(value) for value in state)
         for _ in range(config.substeps):
-            rate = steering_rate(steer_target, now[STEER], h, params)
-            push = acceleration(speed_target, now[SPEED], params)
+            angle = float(params["steer_ratio"]) * steer_target + float(params["steer_trim"])
+            rate = steering_rate(angle, now[STEER], h, params)
+            if config.model == "nonlinear_single_track":
+                push = motor_force(speed_target, now[SPEED] * cosine_wide(now[SLIP]), params) / float(params["m"])
+            else:
+                push = acceleration(speed_target, now[SPEED], params)
             now = integrate(MODELS[config.model], INTEGRATORS[config.integrator], now, rate, push, h, params)
         state = np.array(now, np.float32)
         states.append(state)
@@ -132,7 +137,9 @@ def test_reset_puts_cars_where_they_are_told_rolling_straight_ahead(model):
         rest = np.delete(state, [X, Y, YAW, SPEED, WHEEL_SPEED_FRONT, WHEEL_SPEED_REAR], axis=-1)
         np.testing.assert_array_equal(rest, 0.0)
     assert (np.abs(sim.worlds.state[..., YAW]) <= np.float32(math.pi)).all()
-    np.testing.assert_array_equal(to_values(sim.worlds.params)[..., :-1], to_values(params)[..., :-1])
+    np.testing.assert_array_equal(
+        to_values(sim.worlds.params)[..., : -len(DERIVED)], to_values(params)[..., : -len(DERIVED)]
+    )
     np.testing.assert_array_equal(sim.worlds.time, 0.0)
 
 

@@ -9,13 +9,16 @@ from pydantic import ValidationError
 from outlap.config import load_config, save_config
 from outlap.errors import OutlapError
 from outlap.simulator.vehicle import (
+    DERIVED,
     N_PARAMS,
     NAMES,
     PARAMETERS,
     PRESETS,
     ActuatorParams,
+    AxleTyres,
     LidarParams,
     PacejkaTyre,
+    SensorParams,
     VehicleParams,
     parameter_bounds,
     to_records,
@@ -24,14 +27,14 @@ from outlap.simulator.vehicle import (
 
 
 def field_order() -> list[str]:
-    names = [name for name in VehicleParams.model_fields if name != "tyre"]
-    for config in (PacejkaTyre, ActuatorParams, LidarParams):
+    names = [name for name in VehicleParams.model_fields if name not in ("axles", "tyre")]
+    for config in (AxleTyres, PacejkaTyre, ActuatorParams, SensorParams, LidarParams):
         names += config.model_fields
     return names
 
 
 def test_columns_follow_the_fields():
-    assert PARAMETERS.names == (*field_order(), "kinematic_speed")
+    assert PARAMETERS.names == (*field_order(), *DERIVED)
     assert all(PARAMETERS[name] == np.float32 for name in NAMES)
     values = np.arange(6 * N_PARAMS, dtype=np.float32).reshape(2, 3, N_PARAMS)
     params = to_records(values)
@@ -41,7 +44,7 @@ def test_columns_follow_the_fields():
 
 
 def test_bounds_put_every_value_in_its_own_column():
-    numbers = {name: 0.01 * (number + 1) for number, name in enumerate(field_order())}
+    numbers = {name: 0.1 + 0.001 * number for number, name in enumerate(field_order())}
     for name in ("steer_min", "v_min", "p_ky1"):
         numbers[name] *= -1
     ranges = {name: tuple(sorted((value, 1.5 * value))) for name, value in numbers.items()}
@@ -49,7 +52,8 @@ def test_bounds_put_every_value_in_its_own_column():
     def pick(config, **nested):
         return config(**{name: ranges[name] for name in config.model_fields if name in ranges}, **nested)
 
-    low, high = parameter_bounds(pick(VehicleParams, tyre=pick(PacejkaTyre)), pick(ActuatorParams), pick(LidarParams))
+    vehicle = pick(VehicleParams, axles=pick(AxleTyres), tyre=pick(PacejkaTyre))
+    low, high = parameter_bounds(vehicle, pick(ActuatorParams), pick(LidarParams), pick(SensorParams))
     assert low.shape == high.shape == (N_PARAMS,)
     assert low.dtype == high.dtype == np.float32
     for number, name in enumerate(field_order()):
@@ -69,8 +73,23 @@ def test_presets_are_the_published_cars():
     assert (gym.h, gym.m, gym.I, gym.width, gym.length) == (0.074, 3.74, 0.04712, 0.31, 0.58)
     assert (gym.steer_min, gym.steer_max, gym.steer_rate_max) == (-0.4189, 0.4189, 3.2)
     assert (gym.v_switch, gym.a_max, gym.v_min, gym.v_max) == (7.319, 9.51, -5.0, 20.0)
-    changed = {"mu": 0.8, "a_max": 6.34, "v_min": -8.0, "v_max": 8.0}
+    changed = {"mu": 0.8, "a_max": 6.34, "v_min": -8.0, "v_max": 8.0, "motor_force": 23.71, "motor_power": 173.5}
     assert paper == gym.model_copy(update=changed)
+
+
+@pytest.mark.parametrize("preset", ["f1tenth", "paper"])
+def test_the_forces_of_a_preset_give_its_accelerations(preset):
+    """F = m a_max and P = F v_switch: the same car under every model."""
+    car = to_records(parameter_bounds(PRESETS[preset])[0])
+    assert car["motor_force"] == pytest.approx(car["m"] * car["a_max"], rel=1e-3)
+    assert car["motor_power"] == pytest.approx(car["motor_force"] * car["v_switch"], rel=1e-3)
+
+
+def test_the_default_axles_have_the_cornering_stiffness_of_the_other_models():
+    """B C = C_S: load and friction are the same factors."""
+    car = to_records(parameter_bounds(VehicleParams())[0])
+    assert car["front_B"] * car["front_C"] == pytest.approx(car["C_Sf"], rel=1e-4)
+    assert car["rear_B"] * car["rear_C"] == pytest.approx(car["C_Sr"], rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -102,6 +121,16 @@ def test_presets_are_the_published_cars():
         (VehicleParams, "v_max", 0.0),
         (VehicleParams, "brake_split", 1.1),
         (VehicleParams, "colour", "red"),
+        (AxleTyres, "front_C", 2.0),
+        (AxleTyres, "rear_E", 2.1),
+        (AxleTyres, "rear_peak", 0.0),
+        (VehicleParams, "motor_force", 0.0),
+        (VehicleParams, "brake_force", -1.0),
+        (ActuatorParams, "grip_share", 1.01),
+        (ActuatorParams, "steer_ratio", 0.0),
+        (SensorParams, "speed_noise", -0.1),
+        (SensorParams, "speed_scale", 0.0),
+        (LidarParams, "latency", -0.01),
         (PacejkaTyre, "p_ky1", 21.92),
         (PacejkaTyre, "p_cy1", 0.0),
         (ActuatorParams, "steer_gain", 0.0),
