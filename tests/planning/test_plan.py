@@ -24,7 +24,7 @@ from outlap.planning.limits import CarLimits
 from outlap.planning.line_cache import cached_line
 from outlap.planning.min_laps import min_laps
 from outlap.planning.plan import DEFAULT_MARGIN, METHODS, PlannedLine, plan_line
-from outlap.simulator.vehicle import VehicleParams, parameter_bounds
+from outlap.simulator.vehicle import AxleTyres, VehicleParams, parameter_bounds, to_records
 from outlap.track import Track, load_track
 from outlap.track.centerline import Centerline
 from outlap.track.generate import generate_track
@@ -253,6 +253,36 @@ def test_the_yardstick_of_a_car_that_is_drawn_is_the_lap_planned_for_it(circuit)
     assert len(table.lines) == 5
     assert table.of([car])[0] == pytest.approx(own, rel=0.01)
     assert table.of([low])[0] > table.of([car])[0] > table.of([high])[0]
+
+
+def test_limits_follow_from_forces_and_mass_under_the_nonlinear_model():
+    """a = F / m, v_switch = P / F, and the axle with less friction limits the grip; other models go by a_max."""
+    vehicle = VehicleParams(
+        mu=0.9, m=3.0, motor_force=24.0, brake_force=36.0, motor_power=120.0, a_max=9.0, v_switch=7.0,
+        axles=AxleTyres(front_peak=1.1, rear_peak=0.8),
+    )  # fmt: skip
+    record = to_records(parameter_bounds(vehicle)[0])
+    ours, theirs = (CarLimits.of_record(record, model) for model in ("nonlinear_single_track", "single_track"))
+    assert (ours.mu, ours.a_max, ours.a_brake, ours.v_switch) == pytest.approx((0.72, 8.0, 12.0, 5.0), rel=1e-5)
+    assert (theirs.mu, theirs.a_max, theirs.a_brake, theirs.v_switch) == pytest.approx((0.9, 9.0, 9.0, 7.0), rel=1e-5)
+    assert CarLimits.of(vehicle, "nonlinear_single_track") == ours
+    assert replace(ours, **{name: getattr(theirs, name) for name in ("mu", "a_max", "a_brake", "v_switch")}) == theirs
+
+
+def test_the_yardstick_of_cars_that_differ_in_mass_and_forces(circuit):
+    """Each of two cars at opposite ends laps as planned for it alone, within the table's own error and 1 %."""
+    low, high = parameter_bounds(
+        VehicleParams(mu=(0.5, 1.0), m=(3.0, 4.5), motor_force=(25.0, 40.0), brake_force=(25.0, 45.0), v_max=8.0)
+    )
+    table = min_laps(circuit, (low, high), "nonlinear_single_track")
+    assert 0.0 <= table.error < 0.02
+    weak, strong = to_records(low.copy()), to_records(high.copy())
+    weak["m"], strong["m"] = 4.5, 3.0
+    times = table.of([CarLimits.of_record(car, "nonlinear_single_track") for car in (weak, strong)])
+    for car, time in zip((weak, strong), times, strict=True):
+        own = plan_line(circuit, CarLimits.of_record(car, "nonlinear_single_track")).lap_time
+        assert time == pytest.approx(own, rel=max(0.01, table.error))
+    assert times[0] > 1.1 * times[1]
 
 
 def test_pure_pursuit_drives_the_planned_lap(circuit):

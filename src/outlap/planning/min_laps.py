@@ -61,16 +61,18 @@ def min_laps(track: Track, ends: tuple[np.ndarray, np.ndarray], model: str) -> M
     Raises OutlapError where no line can be planned for the middle of the ranges.
     """
     low, high = _extremes(ends, model)
+    tied = model != "nonlinear_single_track"  # brakes and motor are drawn as one, a_max
     middle = CarLimits.of_record(to_records(np.mean(ends, axis=0)), model)
 
     def plan() -> dict[str, np.ndarray]:
-        table = _table(track, low, middle, high)
+        table = _table(track, low, middle, high, tied)
         arrays = {"error": np.array(table.error), "count": np.array(len(table.lines))}
         for number, line in enumerate(table.lines):
             arrays |= path_arrays(line, f"{number}_")
         return arrays
 
-    saved = cached(["laps", track.fingerprint, *map(asdict, (low, middle, high)), DEFAULT_MARGIN], plan)
+    key = ["laps", track.fingerprint, *map(asdict, (low, middle, high)), DEFAULT_MARGIN]
+    saved = cached(key if tied else [*key, model], plan)
     lines = tuple(path_of(saved, f"{number}_") for number in range(int(saved["count"])))
     return MinLaps(lines, float(saved["error"]))
 
@@ -92,10 +94,9 @@ def _extremes(ends: tuple[np.ndarray, np.ndarray], model: str) -> tuple[CarLimit
     return extremes[0], extremes[1]
 
 
-def _table(track: Track, low: CarLimits, middle: CarLimits, high: CarLimits) -> MinLaps:
+def _table(track: Track, low: CarLimits, middle: CarLimits, high: CarLimits, tied: bool) -> MinLaps:
     line = cached_line(track, middle).path
     drawn = [name for name in DRAWN if getattr(low, name) < getattr(high, name)]
-    tied = (low.a_max, high.a_max) == (low.a_brake, high.a_brake)  # brakes and motor are drawn as one
     if tied and "a_brake" in drawn:
         drawn.remove("a_brake")
     if not drawn:
