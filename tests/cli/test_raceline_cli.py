@@ -92,7 +92,7 @@ def test_a_maps_own_raceline_is_not_replaced_unasked(tmp_path, monkeypatch, capf
         (["--mu", "-1"], "--mu is -1.0; must be > 0"),
         (
             ["--vehicle", "tractor"],
-            "--vehicle is 'tractor'; must be one of f1tenth, paper, a yaml file",
+            "--vehicle is 'tractor'; must be one of f1tenth, paper, forzaeth, a yaml file",
         ),
         (["--vehicle", "track"], "ring5 has no raceline that could ask anything"),
         (["--margin", "1.5"], "it is narrower than 3.31 m"),

@@ -95,6 +95,20 @@ def test_what_a_car_cannot_tell_is_refused(tmp_path: Path, track: str):
             "observes 'frenet', which a car cannot tell",
         ),
         ("reward", MQLConfig, {**META, "reward": "paper"}, SMALL, "observes rewards for milestone, which a car cannot"),
+        (
+            "vehicle",
+            PPOConfig,
+            {**ENV, "observation": ("scan", "vehicle")},
+            PPO,
+            "observes 'vehicle', which a car cannot tell",
+        ),
+        (
+            "command",
+            PPOConfig,
+            {**ENV, "command": "acceleration"},
+            PPO,
+            "commands the acceleration; a car takes speeds",
+        ),
     ):
         run = run_of(config, tmp_path / name, track, env, **settings)
         with pytest.raises(OutlapError, match=said):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +18,15 @@ from outlap.simulator.actuators import (
     delay_steps,
     lag,
     limit_acceleration,
+    limit_force,
     limit_steering_rate,
+    motor_force,
+    ramp,
     steering_rate,
 )
+from outlap.simulator.state import SPEED, STEER, Y
 from outlap.simulator.vehicle import ActuatorParams, VehicleParams, parameter_bounds
+from synthetic_tracks import CAR, place, yard
 
 cars = st.sampled_from([0, 1, 2, 3])
 compiles = settings(deadline=None)
@@ -152,3 +158,114 @@ def test_scalar_functions_read_float32_records_too():
     row = single(small_row())
     assert steering_rate(0.3, 0.1, 0.01, row) == pytest.approx(3.2, rel=1e-6)
     assert acceleration(20.0, 5.0, row) == pytest.approx(9.51, rel=1e-6)
+
+
+# Motors and brakes as forces
+
+
+@pytest.mark.parametrize(
+    ("speed", "target", "force"),
+    [
+        (2.0, 2.5, 6.7 * 0.5),  # proportional to the error, whatever the mass
+        (2.0, 1.0, -6.7),
+        (2.0, 20.0, 30.0),  # the motor's largest
+        (2.0, -20.0, -50.0),  # the brakes'
+        (10.0, 20.0, 20.0),  # 200 W / 10 m/s
+        (-2.0, -20.0, -30.0),  # in reverse the motor drives backwards,
+        (-2.0, 20.0, 50.0),  # and the brakes push forward
+        (0.0, 20.0, 30.0),
+        (20.0, 25.0, 0.0),  # at the top speed
+        (-5.0, -9.0, 0.0),
+    ],
+)
+def test_motor_and_brakes_give_forces_within_their_limits(speed, target, force):
+    row = row_with()
+    row["motor_force"], row["motor_power"], row["brake_force"] = 30.0, 200.0, 50.0
+    for mass in (2.0, 5.0):
+        row["m"] = mass
+        assert motor_force(target, speed, row) == pytest.approx(force, rel=1e-6)
+
+
+@compiles
+@given(st.floats(-6, 21), st.floats(-1e6, 1e6))
+def test_a_motor_never_gives_more_than_its_power(speed, force):
+    row = row_with()
+    given_force = limit_force(force, speed, row)
+    assert given_force * speed <= row["motor_power"] * (1 + 1e-9)
+    assert abs(given_force) <= max(row["motor_force"], row["brake_force"])
+
+
+def test_a_ramp_limits_how_fast_the_commanded_speed_changes():
+    row = row_with(speed_ramp_up=2.0, speed_ramp_down=5.0)
+    assert ramp(1.0, 8.0, 0.01, row) == pytest.approx(1.02)
+    assert ramp(1.0, 1.01, 0.01, row) == pytest.approx(1.01)
+    assert ramp(1.0, -3.0, 0.01, row) == pytest.approx(0.95)
+    assert ramp(1.0, -3.0, 0.01, row_with()) == -3.0
+    assert ramp(1.0, 8.0, 0.01, row_with(speed_ramp_down=5.0)) == 8.0
+
+
+def driven(command: str, model: str, commands: list[tuple[float, float]], speed: float = 3.0, **changes: float):
+    """The speed and the steering angle of a car after each command: (steps, 2)."""
+    params = np.full((1, 1), CAR)
+    for name, value in changes.items():
+        params[name] = value
+    options: dict[str, Any] = {"command": command, "model": model}
+    sim = place(yard(40.0), np.zeros((1, 1, 3)), speed=speed, params=params, beams=0, **options)
+    seen = []
+    for each in commands:
+        sim.step(np.array([[each]]))
+        seen.append(sim.worlds.state[0, 0, [SPEED, STEER]])
+    return np.array(seen)
+
+
+def test_trim_and_ratio_shift_and_scale_the_steering_angle():
+    turned = driven("speed", "kinematic", [(0.1, 3.0)] * 30, steer_trim=-0.02, steer_ratio=1.1)
+    assert turned[-1, 1] == pytest.approx(0.1 * 1.1 - 0.02, abs=1e-6)
+    straight = driven("speed", "kinematic", [(0.0, 3.0)] * 30, steer_trim=0.05)
+    assert straight[-1, 1] == pytest.approx(0.05, abs=1e-6)
+    stopped = driven("speed", "kinematic", [(0.4, 3.0)] * 30, steer_trim=0.2)
+    assert stopped[-1, 1] == pytest.approx(0.4189, abs=1e-6)
+
+
+@pytest.mark.parametrize("model", ["single_track", "nonlinear_single_track"])
+@pytest.mark.parametrize("share", [0.5, -0.25])
+def test_a_command_by_acceleration_is_a_share_of_the_largest_force(model, share):
+    speeds = driven("acceleration", model, [(0.0, share)] * 20)[:, 0]
+    force = CAR["motor_force"] if share > 0 else CAR["brake_force"]
+    largest = CAR["a_max"] if model == "single_track" else force / CAR["m"]
+    assert speeds[-1] - 3.0 == pytest.approx(share * largest * 0.2, rel=1e-3)
+
+
+@pytest.mark.parametrize("model", ["kinematic", "single_track", "nonlinear_single_track"])
+def test_brakes_stop_a_car_and_do_not_reverse_it(model):
+    speeds = driven("acceleration", model, [(0.0, -1.0)] * 150)[:, 0]
+    assert speeds[0] < 3.0
+    assert np.all(np.abs(speeds[-50:]) < 0.1)
+    assert np.ptp(speeds[-50:]) == 0.0
+    again = driven("acceleration", model, [(0.0, -1.0)] * 100 + [(0.0, 0.5)] * 30)[:, 0]
+    assert again[-1] > 1.0
+
+
+def test_a_heavier_car_gains_less_speed_from_the_same_commands():
+    """Twice the mass, half the gain: of the motor's force, and of the speed controller's."""
+    for command, second in (("acceleration", 0.3), ("speed", 4.0)):
+        light, heavy = (
+            driven(command, "nonlinear_single_track", [(0.0, second)] * 10, m=mass)[-1, 0] - 3.0 for mass in (2.5, 5.0)
+        )
+        assert light / heavy == pytest.approx(2.0, rel=0.15 if command == "speed" else 1e-3)
+
+
+def test_anti_lock_brakes_leave_grip_for_steering():
+    """Full brakes in a bend: locked wheels slide straight on, with a share of the grip left the car turns."""
+    turned = []
+    for share in (1.0, 0.8):
+        params = np.full((1, 1), CAR)
+        params["grip_share"], params["brake_force"] = share, 80.0
+        sim = place(
+            yard(40.0), np.zeros((1, 1, 3)), speed=6.0, params=params, beams=0, model="nonlinear_single_track",
+            command="acceleration",
+        )  # fmt: skip
+        for _ in range(40):
+            sim.step(np.array([[[0.25, -1.0]]]))
+        turned.append(sim.worlds.state[0, 0, Y])
+    assert turned[1] > 2.0 * turned[0] + 0.05
