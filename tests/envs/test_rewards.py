@@ -319,3 +319,24 @@ def test_wrong_rewards_are_refused(ellipse, reward, words):
         make_race_vector(1, tracks=[ellipse], beams=0, reward=reward)
     assert "\n" not in str(caught.value)
     assert "reward" in str(caught.value)
+
+
+def test_rewards_and_results_are_of_the_true_motion(ellipse):
+    """Sensors that are wrong in every way change what is observed, and neither the reward nor what is counted."""
+    wrong = {"speed_scale": 1.5, "speed_noise": 0.5, "yaw_rate_bias": 1.0, "yaw_rate_noise": 0.5}
+    races = [
+        make_race_vector(
+            4, tracks=[ellipse], beams=0, control_interval=5, observation="vel", sensors=sensors, odometry=odometry,
+            reward={"weights": {"progress": 1.0, "stall": 1.0, "steering_change": 0.1, "speed_change": 0.1}},
+        )
+        for sensors, odometry in (({}, "full"), (wrong, "vesc"))
+    ]  # fmt: skip
+    for env in races:
+        env.reset(seed=3)
+    for step in range(20):
+        action = np.tile([0.1, -0.4 + 0.02 * step], (4, 1))
+        (seen, reward, *_, info), (seen_wrongly, same_reward, *_, same_info) = (env.step(action) for env in races)
+        np.testing.assert_array_equal(reward, same_reward)
+        for name in ("progress_m", "mean_speed_mps", "episode_return"):
+            np.testing.assert_array_equal(info[name], same_info[name])
+    assert np.abs(seen["vel"] - seen_wrongly["vel"]).max() > 0.3
