@@ -13,8 +13,10 @@ import pytest
 from outlap.cli.main import main
 from outlap.config import save_config
 from outlap.envs.race_config import RaceConfig
+from outlap.evaluation.hot_spots import hot_spots
 from outlap.evaluation.metrics import summarise
 from outlap.simulator.vehicle import VehicleParams
+from outlap.track.catalog import load_track
 from outlap.track.map_io import write_track
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import create_run
@@ -95,6 +97,12 @@ def test_what_is_written_and_shown(made, here, capfd):
     data = json.loads(Path("result.json").read_text())
     assert {name: data[name] for name in summary} == summary
     assert (data["driver"], data["folder"]) == ("run", "here")
+    assert "crash" in rows["outcome"].tolist()
+    assert data["crash_map"] == "here/crashes.png"
+    assert Path("here/crashes.png").stat().st_size > 5_000
+    assert "where they crashed: here/crashes.png" in out
+    lengths = {name: load_track(name).centerline.length for name in ("ring5", "ring4")}
+    assert summary["hot_spots"] == hot_spots(rows, lengths)
 
     record = json.loads(Path("here/evaluation.json").read_text())
     assert record["command"].startswith("outlap")

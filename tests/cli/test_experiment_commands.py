@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from outlap.cli.main import main
+from outlap.evaluation.hot_spots import hot_spots
 
 METHODS = ["vanilla-dr", "mql-abc", "follow-the-gap", "recurrent-ppo"]
 SMALLEST = ["--budget", "smoke", "--seeds", "1", "--methods", *METHODS]
@@ -112,4 +113,7 @@ def test_drivers_are_compared_on_the_same_episodes(tmp_path: Path, capfd: pytest
     assert {each["metric"] for each in data["differences"]} == {"crashes", "progress_m"}
     rows = pd.read_parquet(tmp_path / "report" / "episodes.parquet")
     assert len({tuple(mine["seed"]) for _, mine in rows.groupby("method")}) == 1
+    assert list(data["hot_spots"]) == ["follow-the-gap", "centerline-follower"]
+    for method, found in data["hot_spots"].items():
+        assert found == hot_spots(rows.loc[rows["method"] == method], {"Foxglove": 340.0})
     assert (tmp_path / "report" / "report.html").is_file()

@@ -110,6 +110,7 @@ def test_mistakes_are_one_line(made: Path, here: Path, capfd: pytest.CaptureFixt
         (["plot", "learning", "nowhere"], "is not a run folder"),
         (["plot", "lap-times", "empty"], "holds no episodes.parquet"),
         (["plot", "lap-times", raced], "no episode has a completed lap"),
+        (["plot", "crashes", "empty"], "holds no episodes.parquet"),
         (["watch", "nobody"], "nobody"),
     ):
         capfd.readouterr()

@@ -23,7 +23,7 @@ from outlap.evaluation.protocol import drawn_parameters, episode_seeds, standing
 from outlap.evaluation.rollout import evaluate
 from outlap.planning.plan import DEFAULT_MARGIN
 from outlap.simulator.vehicle import ActuatorParams, LidarParams, PacejkaTyre, VehicleParams, parameter_bounds
-from synthetic_tracks import ring
+from synthetic_tracks import circular, ring
 from untrained_policies import untrained_ppo
 
 LARGE = ring(radius=5.0, half_width=0.8)
@@ -135,6 +135,14 @@ def test_rows_agree_with_each_other(rows):
     assert rows["truncated"].tolist() == (~crashed).tolist()
     assert rows["impact_speed_mps"].notna().tolist() == crashed.tolist()
     assert (rows["impact_speed_mps"][crashed] > 0.5).all()
+    for name in ("crash_s_m", "crash_d_m"):
+        assert rows[name].notna().tolist() == crashed.tolist()
+    for track in (LARGE, SMALL):
+        crashes, length = rows[crashed & (rows["track"] == track.name)], track.centerline.length
+        gone = crashes["start_m"] + crashes["progress_m"] - crashes["crash_s_m"]
+        np.testing.assert_allclose(circular(gone.to_numpy(), length), 0.0, atol=1e-6)
+        assert crashes["crash_s_m"].between(0.0, length, inclusive="left").all()
+        assert crashes["crash_d_m"].abs().between(0.8 - 0.4, 0.8).all()  # a car is 0.58 m long, the wall 0.8 m away
     np.testing.assert_allclose(rows["duration_s"], rows["episode_steps"] * 0.08, rtol=1e-9)
     assert rows["lap_time_s"].notna().tolist() == (rows["completed_laps"] > 0).tolist()
     whole = rows[rows["outcome"] == "finished"]

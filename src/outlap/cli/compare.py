@@ -65,6 +65,7 @@ class Compare(LongCommand):
         with self.progress("racing", total, "episodes") as update:
             rows = race_subjects(groups, races, tracks, self.episodes, self.seed, update)
         record = {**provenance(), "settings": self, "env": races}
-        data = write_comparison(folder, rows, groups, races.num_cars == 1, record)
+        lengths = {track.name: track.centerline.length for track in tracks}
+        data = write_comparison(folder, rows, groups, races.num_cars == 1, lengths, record)
         show = lines((folder / "report.md").read_text(), f"report: {folder / 'report.html'}")
         return CommandResult({**data, "folder": folder}, show)

@@ -80,7 +80,8 @@ class Evaluate(RaceFlags, LongCommand):
         env = standing_starts(found.env, tracks, self.laps, self.time_limit)
         home = found.run.folder if found.run else Path("runs") / found.driver.name
         folder = self.out or dated_folder(home / "evaluations")
-        data = self._evaluate(found, env, tracks, folder)
+        data = {**self._evaluate(found, env, tracks, folder)}
+        data["crash_map"] = _draw_crash_map(folder, tracks, data["hot_spots"])
         result = CommandResult(data, lambda console: show_summary(console, data))
         if not self.record:
             return result
@@ -121,6 +122,27 @@ class Evaluate(RaceFlags, LongCommand):
                 )  # fmt: skip
 
 
+def _draw_crash_map(folder: Path, tracks: Sequence[Track], spots: Sequence[Mapping[str, Any]]) -> Path | None:
+    """Draw the crashes of an evaluation into its folder; return the picture, or None where nobody crashed."""
+    import pandas as pd
+
+    from outlap.envs.terminations import CRASH
+    from outlap.evaluation.results import ROWS
+    from outlap.figure_style import save_figure
+    from outlap.viewer.crash_map import draw_crashes
+
+    rows = pd.read_parquet(folder / ROWS)
+    if CRASH not in rows["outcome"].to_numpy():
+        return None
+    save_figure(draw_crashes(tracks, rows, spots), folder / "crashes.png")
+    return folder / "crashes.png"
+
+
+def _hot_spot_table(spots: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [(spot["track"], f"{spot['s_m']:.1f}", spot["crashes"], f"{spot['share']:.0%}") for spot in spots]
+    return table(("track", "crash hot spot at [m]", "crashes", "share of the track's"), rows, left=("track",))
+
+
 def show_summary(console: Console, data: Mapping[str, Any]) -> None:
     """Print what an evaluation found, and where it is."""
     trained_on = data["trained_on"]
@@ -130,6 +152,9 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
         console.print()
         console.print(_table(data, columns))
     console.print()
+    if data["hot_spots"]:
+        console.print(_hot_spot_table(data["hot_spots"]))
+        console.print()
     console.print("mean ± sd over episodes, [95 % interval of the mean]", style="dim")
     if (error := data["all"]["min_lap_error"]) is not None:
         exact = f", too long by up to {100.0 * error:.2f} % for two cars drawn at random" if error else ""
@@ -138,6 +163,8 @@ def show_summary(console: Console, data: Mapping[str, Any]) -> None:
         )
     if trained_on:
         console.print(f"* trained on {', '.join(trained_on)}: not a result on unseen tracks")
+    if data["crash_map"]:
+        console.print(f"where they crashed: {data['crash_map']}")
     console.print(f"results: {data['folder']}")
 
 

@@ -65,6 +65,7 @@ COMMANDS = (
     Entry("plot trajectories", "outlap.cli.plot:PlotTrajectories", "draw where cars drove, coloured by speed"),
     Entry("plot friction", "outlap.cli.plot:PlotFriction", "draw how much of the tyres' grip was used"),
     Entry("plot lap-times", "outlap.cli.plot:PlotLapTimes", "draw lap times over the least possible, by track"),
+    Entry("plot crashes", "outlap.cli.plot:PlotCrashes", "draw where cars crashed, with the hot spots"),
     Entry("plot learning", "outlap.cli.plot:PlotLearning", "draw learning curves of runs"),
     Entry("plot contexts", "outlap.cli.plot:PlotContexts", "draw how a policy's context tells tasks apart"),
     Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),

@@ -15,6 +15,7 @@ from outlap.cli.races import EpisodeFlags, Episodes
 from outlap.errors import OutlapError
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -93,16 +94,30 @@ class PlotLapTimes(_Plot):
     def draw(self) -> Figure:
         import pandas as pd
 
-        from outlap.evaluation.results import ROWS
         from outlap.viewer.episode_plots import draw_lap_time_ratios
 
         if not self.folders:
             raise OutlapError("no evaluation named; give folders that outlap evaluate has written")
-        for folder in self.folders:
-            if not (folder / ROWS).is_file():
-                raise OutlapError(f"{folder}: holds no {ROWS}; give a folder that outlap evaluate has written")
-        rows = [pd.read_parquet(folder / ROWS) for folder in self.folders]
-        return draw_lap_time_ratios(pd.concat(rows, ignore_index=True))
+        return draw_lap_time_ratios(pd.concat([_read_rows(folder) for folder in self.folders], ignore_index=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlotCrashes(_Plot):
+    """Draw where cars crashed on the maps of an evaluation's tracks, with the hot spots."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """That `outlap evaluate` or `outlap compare` has written."""
+
+    def draw(self) -> Figure:
+        from outlap.evaluation.hot_spots import hot_spots
+        from outlap.track.catalog import load_tracks
+        from outlap.viewer.crash_map import draw_crashes
+
+        rows = _read_rows(self.folder)
+        if "crash_s_m" not in rows:
+            raise OutlapError(f"{self.folder}: its rows do not say where cars crashed; evaluate again")
+        tracks = load_tracks(list(dict.fromkeys(rows["track"].tolist())))
+        return draw_crashes(tracks, rows, hot_spots(rows, {track.name: track.centerline.length for track in tracks}))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,3 +136,14 @@ class PlotLearning(_Plot):
         if not self.runs:
             raise OutlapError("no run named; give run folders of outlap train")
         return draw_learning(learning_curves(self.runs), "Learning")
+
+
+def _read_rows(folder: Path) -> pd.DataFrame:
+    """Return the rows of an evaluation. Raise OutlapError for a folder without them."""
+    import pandas as pd
+
+    from outlap.evaluation.results import ROWS
+
+    if not (folder / ROWS).is_file():
+        raise OutlapError(f"{folder}: holds no {ROWS}; give a folder that outlap evaluate has written")
+    return pd.read_parquet(folder / ROWS)

@@ -14,6 +14,7 @@ import pandas as pd
 from outlap.drivers.driver import Driver
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
+from outlap.evaluation.hot_spots import hot_spots
 from outlap.evaluation.metrics import summarise
 from outlap.evaluation.rollout import EvaluationProgress, evaluate
 from outlap.files import atomic_write, make_folder, to_json
@@ -36,7 +37,7 @@ def evaluate_into(
     facts: Mapping[str, Any] | None = None,
     on_progress: Callable[[EvaluationProgress], None] | None = None,
 ) -> dict[str, Any]:
-    """Evaluate a driver, write rows, summary and record to a folder, and return the summary.
+    """Evaluate a driver, write rows, summary and record to a folder, and return the summary with its `hot_spots`.
 
     Args:
         folder: new or empty; removed again if the evaluation does not finish.
@@ -58,7 +59,8 @@ def evaluate_into(
         with suppress(OSError):
             folder.rmdir()  # it is empty
         raise
-    summary = {**summarise(rows), "trained_on": list(trained_on)}
+    lengths = {track.name: track.centerline.length for track in tracks}
+    summary = {**summarise(rows), "hot_spots": hot_spots(rows, lengths), "trained_on": list(trained_on)}
     record = {
         **provenance(),
         "seconds": round(time.monotonic() - begun, 1),
@@ -91,7 +93,7 @@ def save_results(folder: Path, rows: pd.DataFrame, summary: Mapping[str, Any], r
     Args:
         folder: made by `prepare_folder`.
         rows: of `evaluate`, as Parquet; `pandas.read_parquet` reads them back.
-        summary: of `summarise`, as JSON.
+        summary: of `summarise`, with the hot spots, as JSON.
         record: what is needed to repeat it, as JSON.
     """
     write_rows(rows, folder / ROWS)

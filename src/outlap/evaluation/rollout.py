@@ -28,6 +28,7 @@ from outlap.evaluation.protocol import drawn_parameters, episode_seeds, episode_
 from outlap.planning.limits import CarLimits
 from outlap.planning.min_laps import min_laps
 from outlap.simulator.vehicle import to_records
+from outlap.simulator.worlds import ARC_LENGTH, OFFSET
 from outlap.track.catalog import load_tracks
 from outlap.track.track import Track
 
@@ -82,7 +83,8 @@ def evaluate(
         ego's very vehicle on this track, see `planning.min_laps`; NaN in an episode without a lap), lap_time_ratio (of
         the two before), min_lap_error (part by which the second may be too long), start_m (arc length), progress_m,
         mean_speed_mps, contact (what the ego hit: wall, car or nothing), impact_speed_mps (NaN without a crash,
-        relative to what was hit), opponent_crashes, one column for each of the ego's parameters that
+        relative to what was hit), crash_s_m and crash_d_m (where it was: arc length along the centreline and offset to
+        its left, NaN without a crash), opponent_crashes, one column for each of the ego's parameters that
         is drawn, such as vehicle_mu, the driver of each opponent (opponent_1), and its top speed if that is drawn
         (opponent_1_speed_mps).
 
@@ -193,6 +195,7 @@ class _Races:
             "seed": int(self.seeds[episode]),
             "driver": self.driver.name,
             **_row(info, world),
+            **self._crash(world, info),
             **end,
             "start_m": float(self.start[world] % self.track.centerline.length),
             **({"car": int(info["car"][world])} if self.config.cars else {}),
@@ -201,6 +204,12 @@ class _Races:
             **{f"opponent_{i}_speed_mps": float(info["opponent_speed_mps"][world, i - 1]) for i in drawn_speeds},
             VEHICLE: vehicle,
         }
+
+    def _crash(self, world: int, info: dict[str, Any]) -> dict[str, float]:
+        """Where a world's ego is on the track [m], if it crashed."""
+        s, d = self.env.race.worlds.frenet[world, EGO, [ARC_LENGTH, OFFSET]].tolist()
+        crashed = info["outcome"][world] == CRASH
+        return {"crash_s_m": s if crashed else float("nan"), "crash_d_m": d if crashed else float("nan")}
 
 
 def _with_lap_time_ratios(

@@ -18,6 +18,7 @@ from scipy import stats
 from outlap.drivers.driver import Driver
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError
+from outlap.evaluation.hot_spots import hot_spots
 from outlap.evaluation.protocol import made_for
 from outlap.evaluation.results import ROWS, write_rows
 from outlap.evaluation.rollout import evaluate
@@ -162,9 +163,23 @@ def _difference(a: np.ndarray, b: np.ndarray, paired: bool) -> Estimate:
 
 
 def write_comparison(
-    folder: Path, rows: pd.DataFrame, groups: Mapping[str, Sequence[Subject]], alone: bool, record: Mapping[str, Any]
+    folder: Path,
+    rows: pd.DataFrame,
+    groups: Mapping[str, Sequence[Subject]],
+    alone: bool,
+    lengths: Mapping[str, float],
+    record: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Write `report.md`, `report.html`, `results.json`, the figure and the rows; return the content of the JSON."""
+    """Write `report.md`, `report.html`, `results.json`, the figure and the rows; return the content of the JSON.
+
+    Args:
+        folder: to write to.
+        rows: of `race_subjects`.
+        groups: of `group`.
+        alone: without other cars.
+        lengths: of the centreline of each track [m], by name.
+        record: what is needed to repeat it.
+    """
     methods = list(groups)
     cells, differences, by_seed = compare(rows, methods, alone)
     episodes = len(rows) // sum(len(each) for each in groups.values())
@@ -180,10 +195,22 @@ def write_comparison(
     )
     document.figure("comparison", draw_intervals(cells, ("crashes", "progress_m")))
     document.table(each.row({method: method for method in methods}) for each in differences)
+    spots = {method: hot_spots(rows.loc[rows["method"] == method], lengths) for method in methods}
+    if any(spots.values()):
+        document.text("## Crash hot spots")
+        document.table(
+            {
+                "method": method, "track": spot["track"], "at [m]": f"{spot['s_m']:.1f}",
+                "crashes": str(spot["crashes"]), "share of the track's": f"{spot['share']:.0%}",
+            }
+            for method, found in spots.items()
+            for spot in found
+        )  # fmt: skip
     data = {
         "unit": "seed" if by_seed else "episode",
         "methods": {method: {name: each._asdict() for name, each in row.items()} for method, row in cells.items()},
         "differences": [asdict(each) for each in differences],
+        "hot_spots": spots,
         "runs": {method: [each.name for each in subjects] for method, subjects in groups.items()},
         "record": record,
     }
