@@ -174,3 +174,18 @@ def test_delays_and_latencies_of_a_set_have_room(ellipse, tmp_path):
     env.reset(seed=0)
     env.step(np.zeros((8, 2)))
     assert (env.tasks.max_delay, env.tasks.max_latency) == (pytest.approx(0.06), pytest.approx(0.1))
+
+
+def test_a_reset_may_choose_the_cars_of_a_list(three):
+    env = make_race_vector(4, tracks=[ring()], beams=0, cars=three, autoreset_mode="Disabled")
+    chosen = np.array([2, 0, 1, 2])
+    _, info = env.reset(seed=0, options={"cars": chosen})
+    np.testing.assert_array_equal(info["car"], chosen)
+    np.testing.assert_allclose(to_records(info["vehicle"])["mu"][:, 0], np.array([1.0, 0.5, 0.75, 1.0]), rtol=1e-6)
+    mask = np.array([False, True, False, False])
+    _, info = env.reset(options={"reset_mask": mask, "cars": np.array([0, 1, 0, 0])})
+    np.testing.assert_array_equal(info["car"], [2, 1, 1, 2])
+    with pytest.raises(OutlapError, match="not all numbers of the 3 cars"):
+        env.reset(options={"cars": np.full(4, 3)})
+    with pytest.raises(OutlapError, match="not all numbers of the 0 cars"):
+        make_race_vector(1, tracks=[ring()], beams=0).reset(options={"cars": np.zeros(1, int)})

@@ -14,7 +14,7 @@ from outlap.config import bounds
 from outlap.drivers.driver import Driver
 from outlap.drivers.find import find_drivers
 from outlap.envs.actions import check_actions, commands, speed_spans
-from outlap.envs.car_sets import find_cars
+from outlap.envs.car_sets import CarSet, find_cars
 from outlap.envs.episode_seeds import EpisodeSeeds
 from outlap.envs.episodes import Episodes, final_info
 from outlap.envs.observations import observation_space, observe
@@ -58,6 +58,7 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
         config: RaceConfig,
         tracks: Sequence[Track] | None = None,
         opponents: Sequence[Driver] | None = None,
+        cars: CarSet | None = None,
         *,
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> None:
@@ -69,6 +70,7 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
             tracks: to race on instead of those that `config.tracks` names.
             opponents: to draw from instead of those that `config.opponents` names. Without any, the caller drives all
                 cars with `advance`.
+            cars: to draw from instead of the set that `config.cars` names.
             autoreset_mode: SAME_STEP, or DISABLED for a caller that resets by `reset_mask`.
 
         Raises OutlapError for a wrong number of worlds, a mode that is not offered, and a track or an opponent that
@@ -86,7 +88,8 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
         drivers: Sequence[Driver] = ()
         if config.num_cars > 1:
             drivers = _drivers(config) if opponents is None else opponents
-        cars = find_cars(config.cars) if config.cars else None
+        if cars is None and config.cars:
+            cars = find_cars(config.cars)
         self.tasks = TaskSet(loaded, config.vehicle, config.actuators, config.lidar, config.sensors, cars)
         self._weights = config.reward.resolved()
         self.race = _build_race(num_envs, config, self.tasks, drivers)
@@ -130,7 +133,7 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
         """Begin an episode in every world, or in those of `options["reset_mask"]`, bool (worlds,).
 
         A seed of one number gives world i the seed + i. Without a seed the worlds go on with their streams,
-        so that every episode differs.
+        so that every episode differs. `options["cars"]`, int (worlds,), gives the egos cars of the list `config.cars`.
         """
         mask = None if options is None else options.get("reset_mask")
         mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
@@ -141,7 +144,8 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
             first = self._seeds.seed(seed, which)
             self._np_random_seed = -1 if first is None else first
             self._np_random = np.random.default_rng(first)
-        self._begin(which)
+        egos = None if options is None else options.get("cars")
+        self._begin(which, None if egos is None else np.asarray(egos)[which])
         return self.observe(EGO), self._episodes.info(np.full(self.num_envs, RUNNING))
 
     def step(
@@ -191,10 +195,10 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is open."""
 
-    def _begin(self, which: np.ndarray) -> None:
-        """Draw a task and a start for some worlds, and reset them."""
+    def _begin(self, which: np.ndarray, egos: np.ndarray | None = None) -> None:
+        """Draw a task and a start for some worlds, and reset them; `egos` are numbers of their first cars, (n,)."""
         keys, episodes = self._seeds.next_episodes(which)
-        tracks, params, cars = self.tasks.draw(keys, episodes, self.config.num_cars)
+        tracks, params, cars = self.tasks.draw(keys, episodes, self.config.num_cars, egos)
         self.race.speeds[which] = speed_spans(params, self.config.speed_range)
         if self.opponents.drivers:
             self.race.speeds[which, 1:] = self.opponents.draw(which, keys, episodes, params[:, 1:])

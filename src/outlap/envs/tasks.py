@@ -67,14 +67,20 @@ class TaskSet:
             low[self.cars.columns], high[self.cars.columns] = self.cars.bounds
         return low, high
 
-    def draw(self, keys: np.ndarray, episodes: np.ndarray, num_cars: int) -> Tasks:
+    def draw(self, keys: np.ndarray, episodes: np.ndarray, num_cars: int, egos: np.ndarray | None = None) -> Tasks:
         """Return the tasks of some worlds' next episodes; every car is drawn on its own.
 
         Args:
             keys: uint64 (n,) of the worlds, from `seeding.world_keys`.
             episodes: (n,) number of each world's episode.
             num_cars: cars a world.
+            egos: (n,) numbers in the list of cars that the first cars get; None: drawn too.
+
+        Raises OutlapError for `egos` that are not in a list of cars.
         """
+        listed = self.cars.size if self.cars is not None else 0
+        if egos is not None and not ((egos >= 0) & (egos < listed)).all():
+            raise OutlapError(f"cars: {egos} are not all numbers of the {listed} cars of a list")
         choice = uniform(keys, episodes, TRACK_STREAM, 1)[:, 0]
         low, high = self.bounds
         share = uniform(keys, episodes, PARAMETER_STREAM, num_cars * N_PARAMS)
@@ -83,6 +89,8 @@ class TaskSet:
         cars = np.full((len(keys), num_cars), NO_CAR, np.int64)
         if self.cars is not None and self.cars.listed:
             cars = (uniform(keys, episodes, CAR_STREAM, num_cars) * self.cars.size).astype(np.int64)
+            if egos is not None:
+                cars[:, 0] = egos
             values[..., self.cars.columns] = self.cars.values[cars]
         return Tasks((choice * len(self.tracks)).astype(np.int64), to_records(values), cars)
 

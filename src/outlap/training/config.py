@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 from tyro.conf import arg
 
 from outlap.config import Config
+from outlap.envs.car_sets import is_test_split
 from outlap.envs.race_config import RaceConfig
 from outlap.errors import OutlapError, brief
 
@@ -46,9 +47,20 @@ class TrainingConfig(Config):
             raise ValueError("opponent_split is 'held_out'; must be 'train': no training meets the held-out half")
         return env
 
+    @field_validator("env")
+    @classmethod
+    def _test_cars_are_for_evaluation(cls, env: RaceConfig) -> RaceConfig:
+        if is_test_split(env.cars):
+            raise ValueError(f"cars is {env.cars!r}; must not be a split of test cars: train on 'training' or a file")
+        return env
+
     @abstractmethod
     def model_class(self) -> type[BaseAlgorithm]:
         """The algorithm."""
+
+    def policy_class(self) -> type[Any]:
+        """The class of its networks."""
+        return self.model_class().policy_aliases[self.policy_name]
 
     def constants(self) -> dict[str, Any]:
         """Return the arguments of the algorithm, except for its networks."""
@@ -65,7 +77,7 @@ class TrainingConfig(Config):
     def make_model(self, environment: SB3VecEnv) -> BaseAlgorithm:
         """A model that has learnt nothing yet."""
         networks = {"policy_kwargs": self.network()}
-        return self.model_class()(self.policy_name, environment, **self.constants(), **networks)  # type: ignore[arg-type]
+        return self.model_class()(self.policy_class(), environment, **self.constants(), **networks)  # type: ignore[arg-type]
 
     @property
     def report_every(self) -> int:
