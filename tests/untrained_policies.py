@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from stable_baselines3 import PPO
 
@@ -10,11 +12,13 @@ from outlap.envs.race_config import RaceConfig
 from outlap.track.track import Track
 
 
-def untrained_ppo(config: RaceConfig, track: Track, width: int = 16, seed: int = 0) -> PPO:
+def untrained_ppo(
+    config: RaceConfig, track: Track, width: int = 16, seed: int = 0, policy: Any = "MultiInputPolicy"
+) -> PPO:
     """A PPO model for a task after a single update, with actions all over their range."""
     env = SB3VecEnv(RaceVectorEnv(2, config, [track]))
     model = PPO(
-        "MultiInputPolicy", env, n_steps=4, batch_size=8, n_epochs=1, seed=seed, device="cpu",
+        policy, env, n_steps=4, batch_size=8, n_epochs=1, seed=seed, device="cpu",
         policy_kwargs={"net_arch": [width, width]},
     )  # fmt: skip
     model.learn(8)

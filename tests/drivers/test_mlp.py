@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from outlap.drivers.bounded_policy import BoundedPolicy
 from outlap.drivers.mlp import MLPDriver, MLPStack
 from outlap.drivers.population import load_population, read_manifest, write_manifest
 from outlap.envs.race_config import RaceConfig
@@ -119,3 +120,16 @@ def test_a_tampered_or_empty_population_is_named(tmp_path: Path) -> None:
     driver(9).save(tmp_path / "ring-2.0")
     with pytest.raises(OutlapError, match=r"ring-2\.0\.(json|safetensors): its SHA-256 is [0-9a-f]+, and manifest"):
         load_population(tmp_path)
+
+
+def test_a_policy_with_a_bounded_mean_stays_one_through_a_file(tmp_path: Path) -> None:
+    model = untrained_ppo(TASK, ring(), width=32, policy=BoundedPolicy)
+    ours = MLPDriver.from_ppo(model, "copy", True, (0.0, 4.0))
+    seen = observations(50)
+    expected = model.predict(seen, deterministic=True)[0]
+    assert np.abs(expected).max() < 1.0  # the tanh leaves nothing to clip
+    np.testing.assert_allclose(ours.act(seen), expected, atol=1e-6)
+    ours.save(tmp_path / "bounded")
+    np.testing.assert_array_equal(MLPDriver.load(tmp_path / "bounded").act(seen), ours.act(seen))
+    with pytest.raises(OutlapError, match="another architecture"):
+        MLPStack([ours, MLPDriver.from_ppo(untrained_ppo(TASK, ring(), width=32), "free", True, (0.0, 4.0))])

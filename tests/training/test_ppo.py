@@ -18,6 +18,7 @@ from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.errors import OutlapError
 from outlap.simulator.simulator import Simulator
 from outlap.track.catalog import load_tracks
+from outlap.training.model_file import load_model
 from outlap.training.ppo import PPOConfig
 from outlap.training.run import load_run
 from outlap.training.session import Progress, train
@@ -193,3 +194,21 @@ def test_it_learns_to_drive_round_a_ring() -> None:
     assert begin is not None
     assert end is not None
     assert end > 2.0 * begin  # metres before the episode ends
+
+
+def test_a_bounded_mean_is_kept_through_a_run_folder() -> None:
+    """The policy of the run folder is the bounded one, and its mean stays inside where its layers would leave it."""
+    run = train(SMALL.model_copy(update={"bounded_mean": True}), Path("run"))
+    policy = load_model(run.config, run.policy_path).policy
+    seen = {name: torch.ones(1, *box.shape) for name, box in policy.observation_space.spaces.items()}  # type: ignore[attr-defined]
+    with torch.no_grad():
+        policy.action_net.weight *= 1e3  # type: ignore[union-attr, operator]
+        mean = policy.get_distribution(seen).distribution.mean  # type: ignore[operator, union-attr]
+    assert (mean.abs() <= 1.0).all()
+    assert (mean.abs() > 0.9).any()
+
+
+@pytest.mark.parametrize("cars", ["hard", "outside:10"])
+def test_test_cars_are_not_trained_on(cars) -> None:
+    with pytest.raises(ValueError, match="must not be a split of test cars"):
+        PPOConfig(env=ENV.model_copy(update={"cars": cars}))

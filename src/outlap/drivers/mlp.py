@@ -34,7 +34,8 @@ class MLPDriver(Driver):
     sizes: Mapping[str, int]  # of each term that it sees
     scale_observations: bool = False
     speeds: tuple[float, float]  # pyright: ignore[reportIncompatibleVariableOverride]  # always known
-    activation: str  # between layers; the last is clipped to [-1, 1]
+    activation: str  # between layers
+    bounded: bool = False  # whether a tanh follows the last layer; its actions are clipped to [-1, 1] otherwise
     weights: tuple[np.ndarray, ...]  # float32 (inputs, outputs) of each layer
     biases: tuple[np.ndarray, ...]  # float32 (outputs,)
 
@@ -44,7 +45,7 @@ class MLPDriver(Driver):
 
     def __post_init__(self) -> None:
         shapes = tuple(weight.shape for weight in self.weights)
-        architecture = tuple(sorted(self.sizes.items())), self.scale_observations, self.activation, shapes
+        architecture = tuple(sorted(self.sizes.items())), self.scale_observations, self.activation, self.bounded, shapes
         object.__setattr__(self, "observation_terms", tuple(sorted(self.sizes)))
         object.__setattr__(self, "beams", self.sizes.get("scan"))
         object.__setattr__(self, "architecture", architecture)
@@ -63,6 +64,8 @@ class MLPDriver(Driver):
         """The mean action of a Stable-Baselines3 PPO policy with a Dict observation and no shared layers."""
         import torch
 
+        from outlap.drivers.bounded_policy import BoundedLinear
+
         policy = model.policy
         layers = [*policy.mlp_extractor.policy_net, policy.action_net]
         linear = [layer for layer in layers if isinstance(layer, torch.nn.Linear)]
@@ -77,6 +80,7 @@ class MLPDriver(Driver):
             scale_observations=scale_observations,
             speeds=speeds,
             activation=names[between.pop()],
+            bounded=isinstance(policy.action_net, BoundedLinear),
             weights=tuple(layer.weight.detach().cpu().numpy().T.copy() for layer in linear),
             biases=tuple(layer.bias.detach().cpu().numpy().copy() for layer in linear),
         )
@@ -94,6 +98,7 @@ class MLPDriver(Driver):
             "scale_observations": self.scale_observations,
             "speeds": list(self.speeds),
             "activation": self.activation,
+            "bounded": self.bounded,
             "layers": len(self.weights),
         }
         atomic_write(path.with_name(f"{path.name}.safetensors"), save(tensors))
@@ -122,6 +127,7 @@ class MLPDriver(Driver):
                 scale_observations=bool(facts["scale_observations"]),
                 speeds=(float(facts["speeds"][0]), float(facts["speeds"][1])),
                 activation=str(facts["activation"]),
+                bounded=bool(facts.get("bounded", False)),  # files of earlier versions do not have it
                 weights=tuple(tensors[f"weight_{i}"].astype(np.float32) for i in layers),
                 biases=tuple(tensors[f"bias_{i}"].astype(np.float32) for i in layers),
             )
@@ -158,7 +164,7 @@ class MLPStack(DriverStack):
             if driver.architecture != first.architecture:
                 raise OutlapError(f"{driver.name}: has another architecture than {first.name}; ask them one by one")
         self._drivers = drivers
-        self._activation = ACTIVATIONS[first.activation]
+        self._activation, self._bounded = ACTIVATIONS[first.activation], first.bounded
         depth = range(len(first.weights))
         self._weights = [np.stack([driver.weights[i] for driver in drivers]) for i in depth]
         self._biases = [np.stack([driver.biases[i] for driver in drivers])[:, None] for i in depth]
@@ -195,4 +201,4 @@ class MLPStack(DriverStack):
             x = x @ weight + bias
             if number < len(self._weights) - 1:
                 x = self._activation(x)
-        return x
+        return np.tanh(x) if self._bounded else x

@@ -57,7 +57,7 @@ def load_model(
         raise OutlapError(f"{path}: no such file; must be a policy that outlap train wrote")
     algorithm = config.model_class()
     try:
-        taken = {"policy_class": algorithm.policy_aliases[config.policy_name], "policy_kwargs": config.network()}
+        taken = {"policy_class": config.policy_class(), "policy_kwargs": config.network()}
         taken |= config.constants()
         with zipfile.ZipFile(path) as file:
             size = sum(each.file_size for each in file.infolist())

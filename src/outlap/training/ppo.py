@@ -50,6 +50,7 @@ class PPOConfig(TrainingConfig):
     net_arch: tuple[int, ...] = (128, 128)  # of the policy, and of the value function
     activation: Literal["tanh", "relu"] = "tanh"
     log_std_init: float = -0.5  # log of the initial standard deviation of an action
+    bounded_mean: bool = False  # keep the mean action within [-1, 1], so that no policy creeps at its lowest speed
 
     def constants(self) -> dict[str, Any]:
         """See `TrainingConfig`."""
@@ -64,6 +65,12 @@ class PPOConfig(TrainingConfig):
             "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[self.activation],
             "log_std_init": self.log_std_init,
         }
+
+    def policy_class(self) -> type[Any]:
+        """See `TrainingConfig`."""
+        from outlap.drivers.bounded_policy import BoundedPolicy
+
+        return BoundedPolicy if self.bounded_mean else super().policy_class()
 
     def model_class(self) -> type[BaseAlgorithm]:
         """See `TrainingConfig`."""
@@ -85,6 +92,12 @@ class RecurrentPPOConfig(PPOConfig):
         """See `TrainingConfig`."""
         memory = {"lstm_hidden_size": self.lstm_hidden, "shared_lstm": True, "enable_critic_lstm": False}
         return {**super().network(), **memory}
+
+    def policy_class(self) -> type[Any]:
+        """See `TrainingConfig`."""
+        from outlap.drivers.bounded_policy import BoundedRecurrentPolicy
+
+        return BoundedRecurrentPolicy if self.bounded_mean else TrainingConfig.policy_class(self)
 
     def model_class(self) -> type[RecurrentPPO]:
         """See `TrainingConfig`."""
