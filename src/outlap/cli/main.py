@@ -69,6 +69,11 @@ COMMANDS = (
     Entry("plot learning", "outlap.cli.plot:PlotLearning", "draw learning curves of runs"),
     Entry("plot contexts", "outlap.cli.plot:PlotContexts", "draw how a policy's context tells tasks apart"),
     Entry("benchmark simulator", "outlap.cli.benchmark:BenchmarkSimulator", "measure the simulator's speed"),
+    Entry(
+        "benchmark adaptation",
+        "outlap.cli.benchmark_adaptation:BenchmarkAdaptation",
+        "compare drivers in cars that they never met",
+    ),
     Entry("benchmark mql", "outlap.cli.benchmark:BenchmarkMQL", "measure updates of Meta-Q-Learning"),
     Entry("benchmark car", "outlap.cli.benchmark:BenchmarkCar", "measure an exported policy's latency"),
     Entry("demo", "outlap.cli.demo:Demo", "meta-train, adapt and race on built-in circuits in a few minutes"),
