@@ -117,13 +117,13 @@ def test_adapting_goes_on_with_the_rewards_that_training_ended_with(run: Path, m
     began_at = []
 
     def noting(meta, task, *args, **settings):
-        began_at.append(task.env.training_steps)
+        began_at.append(task.env.training_progress)
         return adapt(meta, task, *args, **settings)
 
     monkeypatch.setattr("outlap.mql.adaptation.adapt", noting)
     words = ["adapt", "run", "--tracks", "ring6", "--seeds", "1", "--clip", "none", *SHORT, "--time-limit", "1"]
     assert main([*words, "--quiet"]) == 0
-    assert began_at == [64]
+    assert began_at == [1.0]
 
 
 def test_a_run_of_a_gpu_is_adapted_on_the_cpu_where_there_is_none(run: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from outlap.envs.keywords import make_race_vector
-from outlap.envs.race_vector_env import RaceVectorEnv
-from outlap.envs.rewards import REWARD_PRESETS, REWARD_TERMS, RewardConfig
+from outlap.envs.rewards import REWARD_PRESETS, REWARD_TERMS, RewardConfig, curriculum_scales
 from outlap.errors import OutlapError
 from outlap.planning.limits import CarLimits
 from outlap.planning.line_cache import cached_line
@@ -23,11 +22,6 @@ STANDSTILL = -0.6  # the speed action that stands for 0 m/s between -5 and 20
 def only(**weights: float) -> dict:
     """A reward of these terms and no others."""
     return {"weights": {**dict.fromkeys(REWARD_TERMS, 0.0), **weights}}
-
-
-def at(env: RaceVectorEnv, training_steps: int) -> None:
-    """Let the next step be step number `training_steps` of training."""
-    env.training_steps = training_steps - env.num_envs
 
 
 def test_the_reward_is_the_sum_of_what_the_info_logs(ellipse, follow):
@@ -143,21 +137,33 @@ def test_all_milestones_of_a_lap_are_counted(circle, put, follow):
     assert set(np.diff(hits)) == {0.0, 5.0}
 
 
-@pytest.mark.parametrize("training_steps", [0, 50_000, 100_000, 10_000_000])
-def test_the_collision_penalty_grows_to_its_maximum(ellipse, put, training_steps):
-    """-(1 + (c_max - 1) tanh(t / 1e5)), once, at the step of the crash."""
-    env = make_race_vector(2, tracks=[ellipse], beams=0, reward={**only(collision=1.0), "collision_max": 4.0})
+@pytest.mark.parametrize("progress", [0.0, 0.1, 0.5, 1.0])
+def test_the_collision_penalty_grows_from_its_minimum_to_its_maximum(ellipse, put, progress):
+    """-(a + (b - a) tanh(p / T) / tanh(1 / T)), at the step of the crash; `previous_reward` shows the last one."""
+    reward = {**only(collision=0.5), "collision_min": 2.0, "collision_max": 5.0, "collision_growth": 0.4}
+    env = make_race_vector(2, tracks=[ellipse], beams=0, reward=reward, observation="previous_reward")
     put(env, np.array([[[0.0, 0.0, 1.3, 5.0]], [[0.0, 0.0, 0.0, 0.0]]]))
+    env.training_progress = progress
     for _ in range(100):
-        at(env, training_steps)
-        _, rewards, terminated, _, _ = env.step(np.array([[0.0, -0.2], [0.0, STANDSTILL]]))
-        assert env.training_steps == training_steps
+        _, rewards, terminated, _, info = env.step(np.array([[0.0, -0.2], [0.0, STANDSTILL]]))
+        assert info["training_progress"].tolist() == [progress] * 2
         assert rewards[1] == 0.0
         if terminated[0]:
             break
         assert rewards[0] == 0.0
     assert terminated[0]
-    assert rewards[0] == pytest.approx(-(1.0 + 3.0 * math.tanh(training_steps / 1e5)), rel=1e-12)
+    expected = -0.5 * (2.0 + 3.0 * math.tanh(progress / 0.4) / math.tanh(1.0 / 0.4))
+    assert rewards[0] == pytest.approx(expected, rel=1e-12)
+    assert info["final_obs"][0]["previous_reward"] == pytest.approx(-2.5, rel=1e-6)
+
+
+def test_the_papers_penalty_is_the_papers_at_the_papers_length():
+    """SYSTEM §2: 1 + (c_max - 1) tanh(t / 1e5), and a sigmoid in (t - 1e6) / 1e5, in trainings of 3e6 steps."""
+    config = RewardConfig(preset="paper", collision_max=7.0)
+    for steps in (0, 5e4, 1e5, 9e5, 1e6, 1.2e6, 3e6):
+        penalty, weight = curriculum_scales(steps / 3e6, config)
+        assert penalty == pytest.approx(1.0 + 6.0 * math.tanh(steps / 1e5), rel=1e-12)
+        assert weight == pytest.approx(1.0 / (1.0 + math.exp((steps - 1e6) / 1e5)), rel=1e-6)
 
 
 def test_a_stall_costs_one_where_it_ends_the_episode(ellipse, put):
@@ -171,28 +177,36 @@ def test_a_stall_costs_one_where_it_ends_the_episode(ellipse, put):
             assert rewards[0] == (expected if truncated[0] else 0.0)
 
 
-def test_training_steps_are_those_of_all_worlds(ellipse):
-    env = make_race_vector(3, tracks=[ellipse], beams=0, control_interval=4)
-    env.reset(seed=0)
-    for step in range(1, 6):
-        env.step(np.zeros((3, 2)))
-        assert env.training_steps == 3 * step
+def test_curricula_stand_at_their_end_outside_of_a_training(ellipse):
+    env = make_race_vector(3, tracks=[ellipse], beams=0)
+    _, info = env.reset(seed=0)
+    assert info["training_progress"].tolist() == [1.0] * 3
+    np.testing.assert_allclose(env.curriculum_scales, [10.0, 0.0], atol=1e-8)
+    env.training_progress = 0.25
+    env.step(np.zeros((3, 2)))
     env.reset()
-    assert env.training_steps == 15, "a reset does not begin training anew"
+    assert env.training_progress == 0.25, "neither a step nor a reset moves a curriculum"
 
 
-@pytest.mark.parametrize("training_steps", [0, 900_000, 1_000_000, 1_200_000, 10_000_000])
-def test_the_velocity_penalty_fades_over_training(big_circle, put, training_steps):
-    """-(v - v_ref)² / (1 + exp((t - 1e6) / 1e5)) with v_ref = sqrt(mu g r) on the inside, the shortest way around."""
+@pytest.mark.parametrize("wrong", [-0.1, 1.5, 2e6, math.nan])
+def test_a_progress_that_is_no_share_is_refused(ellipse, wrong):
+    env = make_race_vector(1, tracks=[ellipse], beams=0)
+    with pytest.raises(OutlapError, match=r"training_progress is .* the share of training done, 0 to 1"):
+        env.training_progress = wrong
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.3, 1 / 3, 0.4, 1.0])
+def test_the_velocity_penalty_fades_over_training(big_circle, put, progress):
+    """-(v - v_ref)² / (1 + exp((p - 1/3) / (1/30))), v_ref = sqrt(mu g r) on the inside, the shortest way around."""
     env = make_race_vector(1, tracks=[big_circle], beams=0, reward=only(velocity_matching=1.0))
     put(env, [2.0, 0.0, 0.0, 3.0])
     half_width = float(big_circle.centerline.width_left[0])
     reference = math.sqrt(1.0489 * 9.81 * (8.0 - half_width + 0.155 + DEFAULT_MARGIN))
+    env.training_progress = progress
     for _ in range(20):
-        at(env, training_steps)
         _, rewards, _, _, _ = env.step(np.array([[0.1, 0.0]]))
         speed = float(env.race.worlds.state[0, 0, 3])
-        expected = -((speed - reference) ** 2) / (1.0 + math.exp(min((training_steps - 1e6) / 1e5, 700.0)))
+        expected = -((speed - reference) ** 2) / (1.0 + math.exp((progress - 1 / 3) * 30))
         assert rewards[0] == pytest.approx(expected, rel=0.02)
 
 
@@ -273,8 +287,7 @@ def test_the_papers_preset():
         "overtaken": 20.0,
     }  # fmt: skip
     assert config.milestones == 10
-    assert config.collision_max > 1.0
-    assert (config.collision_steps, config.velocity_step, config.velocity_width) == (1e5, 1e6, 1e5)
+    assert config.collision_max > config.collision_min
 
 
 def test_the_fast_preset_is_the_default(ellipse):
@@ -309,8 +322,12 @@ def test_every_preset_names_terms_that_exist():
         ({"weight": {"progress": 1.0}}, "weight is not a known field"),
         ({"weights": {"progress": "much"}}, "weights.progress"),
         ({"milestones": 0}, "milestones is 0"),
-        ({"collision_max": 0.5}, "collision_max is 0.5"),
-        ({"collision_steps": 0}, "collision_steps is 0"),
+        ({"collision_max": 0.5}, "collision_max is 0.5; must be at least collision_min, 1"),
+        ({"collision_growth": 0}, "collision_growth is 0"),
+        ({"collision_growth": 1e5}, "collision_growth is 100000"),
+        ({"collision_steps": 1e5}, "collision_steps counts.*collision_growth = collision_steps / total_steps"),
+        ({"velocity_step": 1e6}, "velocity_step counts.*velocity_fade = velocity_step / total_steps"),
+        ({"velocity_width": 1e5}, "velocity_width counts.*velocity_fade_width = velocity_width / total_steps"),
         (3, "reward is 3"),
     ],
 )

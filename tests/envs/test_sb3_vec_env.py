@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 from outlap.envs.episodes import EPISODE_FIELDS
 from outlap.envs.keywords import make_race, make_race_vector, make_sb3
 from outlap.errors import OutlapError
+from outlap.training.callback import CurriculumCallback
 
 SHORT = {"time_limit": 0.2}  # 20 steps
 
@@ -56,8 +57,8 @@ def test_its_shapes_and_types_are_what_sb3_expects(ellipse):
     assert len({id(info) for info in infos}) == 3
     assert env.get_attr("num_envs", [0, 2]) == [3, 3]
     assert env.env_is_wrapped(VecMonitor) == [False] * 3
-    env.set_attr("training_steps", 77)
-    assert env.get_attr("training_steps") == [77] * 3
+    env.set_attr("training_progress", 0.25)
+    assert env.get_attr("training_progress") == [0.25] * 3
     env.close()
 
 
@@ -174,8 +175,10 @@ class Watch(BaseCallback):
     def __init__(self) -> None:
         super().__init__()
         self.ends: list[tuple[bool, str]] = []
+        self.progress: set[float] = set()
 
     def _on_step(self) -> bool:
+        self.progress.update(self.training_env.get_attr("training_progress"))
         for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
             if done:
                 self.ends.append((info["TimeLimit.truncated"], info["outcome"]))
@@ -188,13 +191,14 @@ def test_ppo_learns_on_it(ellipse):
     model = PPO("MultiInputPolicy", env, n_steps=32, batch_size=64, n_epochs=2, seed=0, device="cpu")
     before = [parameter.clone() for parameter in model.policy.parameters()]
     watch = Watch()
-    model.learn(600, callback=watch)
+    model.learn(600, callback=[CurriculumCallback(), watch])
     assert any(not torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
     assert watch.ends
     assert all(truncated == (outcome != "crash") for truncated, outcome in watch.ends)
     assert model.ep_info_buffer is not None
     assert {"r", "l", "progress_m"} <= set(model.ep_info_buffer[0])
-    assert env.env.training_steps == model.num_timesteps
+    assert sorted(watch.progress) == [0.0, 256 / 600, 512 / 600]
+    assert env.env.training_progress == 1.0
     action, _ = model.predict(env.reset(), deterministic=True)
     assert env.action_space.contains(action[0])
 

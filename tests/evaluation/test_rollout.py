@@ -15,7 +15,7 @@ from outlap.drivers.driver import Driver, FunctionDriver
 from outlap.drivers.policy import PolicyDriver
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_env import RaceEnv
-from outlap.envs.rewards import CURRICULA_OVER, RewardConfig
+from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.errors import OutlapError
 from outlap.evaluation import rollout
@@ -62,7 +62,6 @@ def race_alone(driver: Any, config: RaceConfig, track, seed: int) -> dict[str, A
     changes = {"observation": driver.observation_terms, "scale_observations": driver.scale_observations}
     env = RaceEnv(config.model_copy(update=changes), [track])
     observation, info = env.reset(seed=seed)
-    env._env.training_steps = CURRICULA_OVER
     while True:
         action = driver.act({name: value[None] for name, value in observation.items()})[0]
         observation, reward, terminated, truncated, info = env.step(action)

@@ -185,8 +185,8 @@ def test_all_methods_of_a_budget_are_trained_for_the_same_penalties(whole: Plan)
     for unit in whole.units:
         if isinstance(unit, TrainingUnit):
             reward = unit.config.env.reward
-            assert reward.collision_steps == pytest.approx(2 * unit.config.total_steps)
-            assert (reward.resolved()["collision"], reward.collision_max) == (0.3, 33.0)
+            assert (reward.resolved()["collision"], reward.collision_min) == (0.3, 1.0)
+            assert (reward.collision_max, reward.collision_growth) == (15.8, 2.0)
     for unit in make_plan(["all"], "paper", seeds=1).units:
         if isinstance(unit, TrainingUnit):
             assert (unit.config.env.reward.preset, unit.config.env.reward.collision_max) == ("paper", 1.0)

@@ -14,6 +14,7 @@ from stable_baselines3 import PPO
 
 from outlap.config import load_config
 from outlap.envs.race_config import RaceConfig
+from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.errors import OutlapError
 from outlap.simulator.simulator import Simulator
@@ -160,16 +161,22 @@ def test_a_finished_run_is_not_trained_further() -> None:
 
 
 def test_curricula_go_on_from_where_the_run_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[float] = []
+    monkeypatch.setattr(RaceVectorEnv, "training_progress", property(lambda env: 1.0, lambda env, p: seen.append(p)))
     stopped_after(256, SMALL, Path("run"))
-    seen: list[int] = []
+    assert seen == [0.0, 0.25]
     run = load_run("run")
-    from outlap.envs.race_vector_env import RaceVectorEnv
-
-    monkeypatch.setattr(
-        RaceVectorEnv, "training_steps", property(lambda env: 0, lambda env, steps: seen.append(int(steps)))
-    )
     train(run.config, run.folder, resume=run)
-    assert seen == [256]
+    assert seen[2:] == [0.5, 0.75]
+
+
+@pytest.mark.parametrize("steps", [512, 1024])
+def test_a_training_of_another_length_has_the_same_curricula(steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of a training is half, and its last rollout of 128 is near the end, however long it is."""
+    seen: list[float] = []
+    monkeypatch.setattr(RaceVectorEnv, "training_progress", property(lambda env: 1.0, lambda env, p: seen.append(p)))
+    train(SMALL.model_copy(update={"total_steps": steps, "checkpoint_every": 10**6}), Path("run"))
+    np.testing.assert_allclose(seen, np.arange(0, steps, 128) / steps)
 
 
 def test_nothing_is_overwritten_and_mistakes_leave_no_folder() -> None:

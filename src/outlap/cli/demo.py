@@ -19,7 +19,7 @@ class Demo(LongCommand):
     """Meta-train a policy on the built-in training circuits; race it on three that it never saw, adapt, race again.
 
     The same as `outlap train mql` and `outlap adapt --clip abc` with their defaults, but shorter, and the penalty for
-    crashing grows sooner.
+    crashing grows less.
     """
 
     steps: int = 350_000
@@ -42,10 +42,8 @@ class Demo(LongCommand):
         from outlap.training.mql import MQLConfig
 
         usual = MQLConfig()
-        # Over four times the usual share of the training: so short a one has not learnt to drive when the penalty is
-        # high, and then creeps.
-        growth = 4.0 * usual.env.reward.collision_steps * self.steps / usual.total_steps
-        reward = usual.env.reward.model_copy(update={"collision_steps": growth})
+        # So short a training has not learnt to drive when the penalty is high, and then creeps.
+        reward = usual.env.reward.model_copy(update={"collision_max": 3.5, "collision_growth": 3.4})
         env = usual.env.model_copy(update={"reward": reward})
         settings = {"total_steps": self.steps, "seed": self.seed, "held_out_tracks": BUILTIN_HELD_OUT, "env": env}
         config = validate(MQLConfig, settings, "outlap demo")

@@ -98,6 +98,7 @@ class Episodes:
             "laps": worlds.laps[:, EGO].copy(),
             "last_lap_time_s": worlds.lap_time[:, EGO].copy(),
             "time_s": worlds.time.copy(),
+            "training_progress": np.full(len(outcome), self._race.training_progress),
             **{name: total.copy() for name, total in self._statistics.items()},
             **{f"{REWARD_PREFIX}{name}": total.copy() for name, total in self._returns.items()},
         }

@@ -66,8 +66,11 @@ def previous_action(race: Race, car: int) -> np.ndarray:
 
 
 def previous_reward(race: Race, car: int) -> np.ndarray:
-    """The car's reward of the step before; 0 after a reset, and for opponents, whose rewards nobody counts."""
-    return race.rewards[:, car, None]
+    """The car's reward of the step before, as it is when a training ends: curricula do not change its meaning.
+
+    0 after a reset, and for opponents, whose rewards nobody counts.
+    """
+    return race.final_rewards[:, car, None]
 
 
 def vehicle(race: Race, car: int) -> np.ndarray:

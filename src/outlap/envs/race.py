@@ -28,7 +28,7 @@ class Race:
     nearby_cars: int  # of which the observation term of that name tells
     racing_line: np.ndarray  # float32 (rows of the atlas, 3), see `racing_lines`
     reference: ReferenceSpeeds | None = None  # for the reward that asks for them
-    training_steps: int = 0  # environment steps so far, all worlds together
+    training_progress: float = 1.0  # share of the training that is done: where reward curricula stand
     actions: np.ndarray = field(init=False)  # (worlds, cars, 2) of this step
     actions_before: np.ndarray = field(init=False)  # of the step before; after a reset equal to `actions`
     speeds: np.ndarray = field(init=False)  # (worlds, cars, 2) [m/s] that the speed actions -1 and 1 command
@@ -45,6 +45,7 @@ class Race:
     places_lost: np.ndarray = field(init=False)
     cars: np.ndarray = field(init=False)  # int64 (worlds, cars): number in the set of cars, or NO_CAR
     rewards: np.ndarray = field(init=False)  # of this step, 0 after a reset
+    final_rewards: np.ndarray = field(init=False)  # the same as they are when the training ends
 
     def __post_init__(self) -> None:
         everyone = self.simulator.num_worlds, self.simulator.num_cars
@@ -64,6 +65,7 @@ class Race:
         self.places_lost = np.zeros(everyone, np.int64)
         self.cars = np.full(everyone, -1, np.int64)
         self.rewards = np.zeros(everyone)
+        self.final_rewards = np.zeros(everyone)
 
     @property
     def worlds(self) -> Worlds:
@@ -124,6 +126,7 @@ class Race:
         self.places_lost[which] = 0
         self.outcome[which] = RUNNING
         self.rewards[which] = 0.0
+        self.final_rewards[which] = 0.0
 
     def act(self, actions: np.ndarray) -> None:
         """Take note of the actions (worlds, cars, 2) that the next step will carry out."""

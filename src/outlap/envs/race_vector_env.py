@@ -22,7 +22,7 @@ from outlap.envs.opponents import Opponents
 from outlap.envs.race import EGO, RUNNING, Race
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.racing_line import ReferenceSpeeds, racing_lines
-from outlap.envs.rewards import weighted_terms
+from outlap.envs.rewards import CURRICULA, CURRICULUM_END, curriculum_scales, scaled_terms, weighted_terms
 from outlap.envs.road import draw_road
 from outlap.envs.starts import reset_worlds
 from outlap.envs.tasks import TaskSet
@@ -95,14 +95,14 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
         self.race = _build_race(num_envs, config, self.tasks, drivers)
         self.opponents = Opponents(drivers, self.race, config.opponent_speed, config.opponent_noise)
         self.taken_over: dict[int, np.ndarray] = {}  # actions (2,) of cars that are driven in place of their drivers
-        self.reward_terms: dict[int, dict[str, np.ndarray]] = {}  # weighted, of the last step, by car
+        self.reward_terms: dict[int, dict[str, np.ndarray]] = {}  # weighted and scaled, of the last step, by car
+        self._curriculum_terms = np.zeros((num_envs, len(CURRICULA)))
         # The cars without a driver: the caller drives them, and they have outcomes and rewards.
         self._learners = range(1 if drivers else config.num_cars)
         self._seeds = EpisodeSeeds(num_envs)
         self._episodes = Episodes(self.race, self.opponents, self._weights)
         self._wrecks = Wrecks(self.race, config.opponent_crash)
         self._over = np.ones(num_envs, bool)  # waits for a reset
-
         interval = config.control_interval * config.timestep
         self.metadata = {"autoreset_mode": autoreset_mode, "render_modes": [], "render_fps": round(1 / interval)}
         self.single_observation_space = observation_space(
@@ -114,13 +114,25 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     @property
-    def training_steps(self) -> int:
-        """Environment steps so far, all worlds together: what curricula go by."""
-        return self.race.training_steps
+    def training_progress(self) -> float:
+        """Share of the training that is done, 0 … 1: where reward curricula stand. 1 unless a training sets it."""
+        return self.race.training_progress
 
-    @training_steps.setter
-    def training_steps(self, steps: int) -> None:
-        self.race.training_steps = int(steps)
+    @training_progress.setter
+    def training_progress(self, progress: float) -> None:
+        if not 0.0 <= progress <= CURRICULUM_END:
+            raise OutlapError(f"training_progress is {progress!r}; must be the share of training done, 0 to 1")
+        self.race.training_progress = float(progress)
+
+    @property
+    def curriculum_terms(self) -> np.ndarray:
+        """The ego's weighted terms of `CURRICULA` in the last step, unscaled, 0 if unused: (worlds, terms)."""
+        return self._curriculum_terms.copy()
+
+    @property
+    def curriculum_scales(self) -> np.ndarray:
+        """What these terms are multiplied with at present: (terms,)."""
+        return curriculum_scales(self.race.training_progress, self.config.reward)
 
     @property
     def wrecked(self) -> np.ndarray:
@@ -181,16 +193,24 @@ class RaceVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
             commands(race.actions, race.worlds.params, race.speeds, config.command), config.control_interval
         )
         race.advance(config.termination.stall_distance)
-        race.training_steps += self.num_envs
         for car in self._learners:
             race.outcome[:, car] = outcomes(race, car, config.termination)
-            terms = weighted_terms(race, car, config.reward, self._weights)
-            race.rewards[:, car] = sum(terms.values())
-            self.reward_terms[car] = terms
+            self._reward(car)
 
     def observe(self, car: int) -> dict[str, np.ndarray]:
         """Return the observation of a car: (worlds, size) of every term, float32."""
         return observe(self.race, car, self.config.observation, self.config.scale_observations)
+
+    def _reward(self, car: int) -> None:
+        """Note the reward of a car for the last step, at present and as it is when the training ends."""
+        race, config = self.race, self.config.reward
+        terms = weighted_terms(race, car, config, self._weights)
+        self.reward_terms[car] = scaled_terms(terms, race.training_progress, config)
+        race.rewards[:, car] = sum(self.reward_terms[car].values())
+        race.final_rewards[:, car] = sum(scaled_terms(terms, CURRICULUM_END, config).values())
+        if car == EGO:
+            for column, name in enumerate(CURRICULA):
+                self._curriculum_terms[:, column] = terms.get(name, 0.0)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is open."""

@@ -1,10 +1,12 @@
 """Reward terms, a function a term, and the presets that weigh them.
 
-A term is unweighted: (worlds,) float of one car. The reward is the sum of weight × term. Constants: `RewardConfig`.
+A term is unweighted: (worlds,) float of one car. The reward is the sum of weight × scale × term, where the scale of a
+term with a curriculum depends on the training's progress, 0 … 1; other terms have none. Constants: `RewardConfig`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -15,27 +17,53 @@ from outlap.config import Config
 from outlap.envs.race import Race
 from outlap.envs.terminations import STALLED
 
-CURRICULA_OVER = 10**12  # training steps at which every curriculum is at its end
+CURRICULUM_END = 1.0  # progress of a finished training; environments outside of a training stand here
+IN_STEPS = {  # constants of earlier versions, in environment steps, and what replaces them
+    "collision_steps": "collision_growth",
+    "velocity_step": "velocity_fade",
+    "velocity_width": "velocity_fade_width",
+}
 
 
 class RewardConfig(Config):
     """Which terms count, how much, and their constants.
 
-    The curricula count environment steps of all worlds together since training began.
+    Curricula depend on the share of the training that is done, 0 … 1, so that a longer training has the same ones.
     """
 
     preset: Literal["fast", "paper"] = "fast"  # where weights come from
     weights: dict[str, float] = Field(default={})  # by term, in place of the preset's
     milestones: int = Field(default=10, ge=1)  # per lap
-    collision_max: float = Field(default=10.0, ge=1)  # to which the collision penalty grows; 1 = never grows
-    collision_steps: float = Field(default=1e5, gt=0)  # over which it grows
-    velocity_step: float = 1e6  # at which the weight of velocity matching has halved
-    velocity_width: float = Field(default=1e5, gt=0)  # [steps] of that fall
+    collision_min: float = Field(default=1.0, ge=0)  # the collision penalty when training begins
+    collision_max: float = Field(default=10.0, ge=0)  # and when it ends; equal to `collision_min` it never grows
+    collision_growth: float | None = Field(default=None, gt=0, le=10)  # share of training, see `collision_penalty`
+    velocity_fade: float = Field(default=1 / 3, ge=0, le=1)  # share of training at which velocity matching has halved
+    velocity_fade_width: float = Field(default=1 / 30, gt=0, le=1)  # share of training over which it falls
 
     @model_validator(mode="before")
     @classmethod
     def _from_preset_name(cls, value: Any) -> Any:
         return {"preset": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _penalty_never_falls(self) -> RewardConfig:
+        if self.collision_max < self.collision_min:
+            raise ValueError(
+                f"collision_max is {self.collision_max:g}; must be at least collision_min, {self.collision_min:g}"
+            )
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_steps(cls, value: Any) -> Any:
+        given: Any = value
+        for name, now in IN_STEPS.items() if isinstance(given, dict) else ():
+            if name in given:
+                raise ValueError(
+                    f"{name} counts environment steps, which curricula no longer do; "
+                    f"give {now} = {name} / total_steps, a share of the training"
+                )
+        return value
 
     @field_validator("weights")
     @classmethod
@@ -46,7 +74,7 @@ class RewardConfig(Config):
         return weights
 
     def without_curricula(self) -> RewardConfig:
-        """The reward after `CURRICULA_OVER` steps, without the term that is zero then: it needs planned lines."""
+        """The reward for the end of the curricula, without the term that is zero then: it needs planned lines."""
         return self.model_copy(update={"weights": {**self.weights, "velocity_matching": 0.0}})
 
     def resolved(self) -> dict[str, float]:
@@ -73,9 +101,8 @@ def lap_progress(race: Race, car: int, config: RewardConfig) -> np.ndarray:
 
 
 def collision(race: Race, car: int, config: RewardConfig) -> np.ndarray:
-    """-(1 + (c_max - 1) tanh(t / T)) where the car crashed: a penalty that grows over training."""
-    growth = np.tanh(race.training_steps / config.collision_steps)
-    return np.where(race.crashed[:, car], -(1.0 + (config.collision_max - 1.0) * growth), 0.0)
+    """-1 where the car crashed, scaled by `collision_penalty`."""
+    return -race.crashed[:, car].astype(np.float64)
 
 
 def stall(race: Race, car: int, config: RewardConfig) -> np.ndarray:
@@ -84,12 +111,10 @@ def stall(race: Race, car: int, config: RewardConfig) -> np.ndarray:
 
 
 def velocity_matching(race: Race, car: int, config: RewardConfig) -> np.ndarray:
-    """-(v - v_ref)^2 w(t) [m^2/s^2]: v_ref on the minimum-time line; w falls over training from 1 to 0 as a sigmoid."""
+    """-(v - v_ref)^2 [m^2/s^2], scaled by `velocity_weight`; v_ref is the speed on the minimum-time line."""
     assert race.reference is not None  # the environment has it where this term counts
     reference = race.reference.at(car, race.worlds.track, race.line_rows(car, np.zeros(1))[:, 0])
-    x = (race.training_steps - config.velocity_step) / config.velocity_width
-    weight = 0.5 * (1.0 - np.tanh(0.5 * x))
-    return -weight * (race.speed[:, car] - reference) ** 2
+    return -((race.speed[:, car] - reference) ** 2)
 
 
 def steering_change(race: Race, car: int, config: RewardConfig) -> np.ndarray:
@@ -126,8 +151,39 @@ REWARD_TERMS: dict[str, Callable[[Race, int, RewardConfig], np.ndarray]] = {
 }
 
 
+def collision_penalty(progress: float, config: RewardConfig) -> float:
+    """c_min + (c_max - c_min) tanh(p / T) / tanh(1 / T): T is `collision_growth`, or the preset's."""
+    growth = COLLISION_GROWTH[config.preset] if config.collision_growth is None else config.collision_growth
+    share = math.tanh(progress / growth) / math.tanh(1.0 / growth)
+    return config.collision_min + (config.collision_max - config.collision_min) * share
+
+
+def velocity_weight(progress: float, config: RewardConfig) -> float:
+    """1 / (1 + exp((p - `velocity_fade`) / `velocity_fade_width`)): it falls over training from 1 to 0."""
+    return 0.5 * (1.0 - math.tanh(0.5 * (progress - config.velocity_fade) / config.velocity_fade_width))
+
+
+CURRICULA: dict[str, Callable[[float, RewardConfig], float]] = {
+    "collision": collision_penalty,
+    "velocity_matching": velocity_weight,
+}
+"""The scale of a term at a progress of the training, 0 … 1."""
+
+
+def curriculum_scales(progress: float, config: RewardConfig) -> np.ndarray:
+    """Return the scale of each term of `CURRICULA`, in its order: (terms,)."""
+    return np.array([scale(progress, config) for scale in CURRICULA.values()])
+
+
+def scaled_terms(terms: Mapping[str, np.ndarray], progress: float, config: RewardConfig) -> dict[str, np.ndarray]:
+    """Return weighted terms, (worlds,) each, as they count at a progress of the training; their sum is the reward."""
+    return {
+        name: term * CURRICULA[name](progress, config) if name in CURRICULA else term for name, term in terms.items()
+    }
+
+
 def weighted_terms(race: Race, car: int, config: RewardConfig, weights: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """Return weight × term for the last step of a car, (worlds,) each; their sum is its reward.
+    """Return weight × term for the last step of a car, (worlds,) each; see `scaled_terms`.
 
     Args:
         race: after the step, with its outcomes.
@@ -137,6 +193,9 @@ def weighted_terms(race: Race, car: int, config: RewardConfig, weights: Mapping[
     """
     return {name: weight * REWARD_TERMS[name](race, car, config) for name, weight in weights.items()}
 
+
+# `tanh(t / 1e5)` in the paper, whose trainings have three million steps.
+COLLISION_GROWTH = {"fast": 0.5, "paper": 1 / 30}  # by preset, share of a training
 
 REWARD_PRESETS: dict[str, dict[str, float]] = {
     # Learns within minutes: progress, and a smooth hand.

@@ -14,7 +14,6 @@ from outlap.envs.actions import driver_actions
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
-from outlap.envs.rewards import CURRICULA_OVER
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
 from outlap.evaluation.frame import Frame, cast_of, frame_of
@@ -77,7 +76,6 @@ def record_episode(
     recorder.see(info, np.zeros(2, np.float32))
     over = False
     while not over:
-        race.training_steps = CURRICULA_OVER
         action = driver_actions(driver, observation, 1)
         observation, _, terminated, truncated, info = race.step(action)
         recorder.see(info, action[0])

@@ -21,7 +21,7 @@ from outlap.envs.actions import driver_actions
 from outlap.envs.race import EGO, Race
 from outlap.envs.race_config import RaceConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
-from outlap.envs.rewards import CURRICULA_OVER, RewardConfig, weighted_terms
+from outlap.envs.rewards import CURRICULUM_END, RewardConfig, scaled_terms, weighted_terms
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
 from outlap.evaluation.protocol import drawn_parameters, episode_seeds, episode_task, parameter_ends
@@ -151,7 +151,6 @@ class _Races:
         driver.begin(np.ones(worlds, bool))
         self.start[:] = env.race.start[:, EGO]
         while len(self.rows) < len(self.seeds):
-            env.training_steps = CURRICULA_OVER
             observation, rewards, terminated, truncated, info = env.step(driver_actions(driver, observation, worlds))
             self.steps += int((self.episode != IDLE).sum())
             over = terminated | truncated
@@ -248,7 +247,8 @@ class _Score:
         """The reward of the last step and the return so far: (worlds,) each."""
         if self.weights is None:
             return rewards, info["episode_return"]
-        last = np.zeros(len(self.returns)) + sum(weighted_terms(race, EGO, self.config, self.weights).values())
+        terms = weighted_terms(race, EGO, self.config, self.weights)
+        last = np.zeros(len(self.returns)) + sum(scaled_terms(terms, CURRICULUM_END, self.config).values())
         self.returns += last
         return last, self.returns
 

@@ -102,8 +102,9 @@ class AdaptationUnit(Unit):
             return meta
         settings = adaptation_settings(self.settings)
         env = self.env.model_copy(update={"tracks": (self.track,), "augment_tracks": False})
+        progress = min(1.0, meta.num_timesteps / load_run(self.run_folder).config.total_steps)
         adapted, record = adapt(
-            meta, collecting_env(env, self.worlds, meta.num_timesteps, self.seed), settings, seed=self.seed,
+            meta, collecting_env(env, self.worlds, progress, self.seed), settings, seed=self.seed,
             on_iteration=lambda done, _: report(0.5 * (done + 1) / settings.iterations),
         )  # fmt: skip
         updates = pd.DataFrame(record.updates)

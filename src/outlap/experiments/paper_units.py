@@ -216,16 +216,16 @@ class ClippingUnit(Unit):
 def collecting(unit: TrainingUnit, task: Task, work: Path, seed: int) -> SB3VecEnv:
     """Return the environment that an adaptation collects from: as in training, but for the task."""
     env = changed(unit.config.env, task.changes, {"tracks": [task.track], "augment_tracks": False})
-    return collecting_env(resolve(env, unit.population, work), COLLECTING_WORLDS, unit.config.total_steps, seed)
+    return collecting_env(resolve(env, unit.population, work), COLLECTING_WORLDS, 1.0, seed)
 
 
-def collecting_env(env: RaceConfig, worlds: int, training_steps: int, seed: int) -> SB3VecEnv:
-    """Return an environment to collect from, whose curricula are where the training ended."""
+def collecting_env(env: RaceConfig, worlds: int, training_progress: float, seed: int) -> SB3VecEnv:
+    """Return an environment to collect from, whose curricula are where the training ended, 0 … 1."""
     from outlap.envs.race_vector_env import RaceVectorEnv
     from outlap.envs.sb3_vec_env import SB3VecEnv
 
     collecting = SB3VecEnv(RaceVectorEnv(worlds, env))
-    collecting.env.training_steps = training_steps
+    collecting.env.training_progress = training_progress
     collecting.seed(COLLECTING_SEED + seed)
     return collecting
 

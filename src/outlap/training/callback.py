@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,9 @@ from outlap.envs.terminations import CRASH
 from outlap.training.checkpoints import begin_episodes, check_finite, reseed, save_progress
 from outlap.training.config import TrainingConfig
 from outlap.training.run import Run
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,26 @@ class Stopwatch:
     @property
     def seconds(self) -> float:
         return time.monotonic() - self._start
+
+
+def advance_curricula(model: BaseAlgorithm, total_steps: int) -> None:
+    """Tell the environment of a model which share of the training is done."""
+    environment = model.get_env()
+    assert environment is not None
+    environment.set_attr("training_progress", min(1.0, model.num_timesteps / total_steps))
+
+
+class CurriculumCallback(BaseCallback):
+    """For trainings with Stable-Baselines3 alone: let reward curricula follow the progress of `learn`."""
+
+    def _on_rollout_start(self) -> None:
+        advance_curricula(self.model, self.model._total_timesteps)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        advance_curricula(self.model, self.model.num_timesteps)
 
 
 class TrainingCallback(BaseCallback):
@@ -64,6 +88,7 @@ class TrainingCallback(BaseCallback):
             self._saved_at = self._reported_at = steps
             reseed(self.model, self._config)
             begin_episodes(self.model)
+        advance_curricula(self.model, self._config.total_steps)
 
     def _on_rollout_end(self) -> None:
         steps = self.model.num_timesteps

@@ -28,7 +28,7 @@ class MQLConfig(TrainingConfig, TD3Config):
         update={
             "observation": ("scan", "vel", "heading", "previous_action", "previous_reward"),
             # Crashes that cost all from the start teach it to creep.
-            "reward": RewardConfig(collision_steps=3e6),
+            "reward": RewardConfig(collision_max=8.4, collision_growth=6 / 7),
         }
     )
     total_steps: Annotated[int, arg(aliases=["--steps"])] = Field(default=3_500_000, gt=0)  # actions, all worlds

@@ -57,7 +57,6 @@ def train(
         model = newest_model(run, environment, config) or config.make_model(environment)
     run.write_record(tracks={track.name: track.fingerprint for track in environment.env.tasks.tracks})
     clock = Stopwatch(float(run.record().get("seconds", 0.0)) if model.num_timesteps else 0.0)
-    environment.env.training_steps = model.num_timesteps
     _learn(model, config, run, clock, on_progress)
     check_finite(model, run)
     save_checkpoint(run, model, "policy.zip", "replay.npz")

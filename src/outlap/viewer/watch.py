@@ -10,7 +10,6 @@ from outlap.drivers.driver import Driver
 from outlap.envs.actions import driver_actions
 from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig
-from outlap.envs.rewards import CURRICULA_OVER
 from outlap.evaluation.frame import Frame, between, cast_of, frame_of
 from outlap.evaluation.protocol import single_race
 from outlap.evaluation.recorder import how_it_ended
@@ -108,7 +107,6 @@ class Watch:
 
     def _step(self) -> None:
         """An action of every car."""
-        self.env.training_steps = CURRICULA_OVER
         self._before = self._now
         if self._outcome:
             return
