@@ -12,14 +12,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from outlap.envs.keywords import make_sb3
 from outlap.errors import OutlapError
+from outlap.mql.batch import Batch, Windows
 from outlap.mql.collector import add_step, begin_episodes, task_of
-from outlap.mql.replay import Batch, ReplayBuffer, TaskName, Windows
+from outlap.mql.context_vec_env import ContextVecEnv
+from outlap.mql.replay import ReplayBuffer, TaskName
+from synthetic_tracks import ring
 
 VEL = gym.spaces.Dict({"vel": gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)})
-FIELDS = ("action", "reward", "terminated", "before", "after", "task")
+FIELDS = ("action", "reward", "curriculum", "terminated", "before", "after", "task")
 
 
 def space(**sizes: int) -> gym.spaces.Dict:
@@ -840,3 +844,58 @@ def test_a_step_that_ends_episodes_stores_where_they_ended_and_begins_the_next()
     assert buffer.added == 15
     assert buffer.tasks == ["a", "b", "c", "d", "e"]
     assert [buffer.transitions(task) for task in buffer.tasks] == [4, 1, 1, 1, 1]
+
+
+def test_rewards_are_read_with_the_present_scales(tmp_path: Path):
+    """Two steps of 1 + 10 a, then 2 + 20 a + 5 b, by hand, at two scales; saved and loaded too."""
+    buffer = ReplayBuffer(20, VEL, 1, 1, curriculum_terms=2)
+    begin(buffer, [0], [1], ["task"])
+    for reward, terms in ((1.0, [10.0, 0.0]), (2.0, [20.0, 5.0])):
+        buffer.add(np.array([0]), vel(0.0), np.zeros((1, 1)), np.array([reward]), np.zeros(1, bool), np.array([terms]))
+    first = np.array([0])
+    assert gather(buffer, first, history=1, n_steps=2, gamma=0.5).reward.tolist() == [1.0 + 0.5 * 2.0]
+    buffer.scales = np.array([0.1, 2.0])
+    expected = [1.0 + 1.0 + 0.5 * (2.0 + 2.0 + 10.0)]
+    assert gather(buffer, first, history=1, n_steps=2, gamma=0.5).reward.tolist() == expected
+    again = ReplayBuffer.load(buffer.save(tmp_path / "replay.npz"))
+    assert gather(again, first, history=1, n_steps=2, gamma=0.5).reward.tolist() == expected
+
+
+def test_a_crash_that_is_kept_costs_what_a_crash_costs_now():
+    """Cars crash when the penalty is 1; drawn when it is 8, the same rows cost 8, and no other row changes."""
+    reward = {"weights": {"progress": 1.0, "collision": 2.0}, "collision_max": 8.0}
+    env = ContextVecEnv(make_sb3(8, tracks=[ring(5.0)], beams=0, reward=reward, observation="vel", control_interval=5))
+    env.set_attr("training_progress", 0.0)
+    assert isinstance(env.observation_space, gym.spaces.Dict)
+    buffer = ReplayBuffer(10_000, env.observation_space, 2, 8, curriculum_terms=2)
+    env.seed(0)
+    begin_episodes(buffer, env, cast("dict[str, np.ndarray]", env.reset()))
+    given: list[np.ndarray] = []
+    for _ in range(60):
+        observation, rewards, dones, infos = env.step(np.tile([0.6, 0.2], (8, 1)))
+        add_step(buffer, env, cast("dict[str, np.ndarray]", observation), np.zeros((8, 2)), rewards, dones, infos)
+        given.append(rewards)
+    serial = np.concatenate([recent.at(np.arange(recent.count(0)), 0) for recent in buffer._departures])
+    then = gather(buffer, serial, history=1)
+    assert np.sort(then.reward) == pytest.approx(np.sort(np.concatenate(given)), abs=1e-5)
+    crashed = then.discount == 0.0
+    assert 8 <= crashed.sum() < len(crashed)
+    env.set_attr("training_progress", 1.0)
+    observation, rewards, dones, infos = env.step(np.zeros((8, 2)))
+    add_step(buffer, env, cast("dict[str, np.ndarray]", observation), np.zeros((8, 2)), rewards, dones, infos)
+    now = gather(buffer, serial, history=1)
+    np.testing.assert_allclose(now.reward - then.reward, np.where(crashed, -2.0 * (8.0 - 1.0), 0.0), atol=1e-5)
+
+
+def test_a_reward_that_a_wrapper_changed_is_kept_as_it_is():
+    inner = make_sb3(4, tracks=[ring(5.0)], beams=0, observation="vel", control_interval=5)
+    env = ContextVecEnv(VecNormalize(inner, norm_obs=False))
+    assert isinstance(env.observation_space, gym.spaces.Dict)
+    buffer = ReplayBuffer(10_000, env.observation_space, 2, 4, curriculum_terms=2)
+    env.seed(0)
+    begin_episodes(buffer, env, cast("dict[str, np.ndarray]", env.reset()))
+    for _ in range(40):
+        observation, rewards, dones, infos = env.step(np.tile([0.6, 0.2], (4, 1)))
+        add_step(buffer, env, cast("dict[str, np.ndarray]", observation), np.zeros((4, 2)), rewards, dones, infos)
+    assert not buffer.curriculum.any()
+    assert (buffer.terminated & (buffer.reward != 0.0)).any()

@@ -17,13 +17,14 @@ import torch
 from stable_baselines3.common.vec_env import VecEnv
 
 from outlap.errors import OutlapError
+from outlap.mql.batch import Batch
 from outlap.mql.collector import Collector
 from outlap.mql.config import AdaptationConfig
 from outlap.mql.learner import td3_update
 from outlap.mql.mql import MQL
 from outlap.mql.policies import MQLPolicy
 from outlap.mql.propensity import ClipState, Propensity, effective_sample_size, fit_propensity
-from outlap.mql.replay import Batch, ReplayBuffer
+from outlap.mql.replay import ReplayBuffer
 
 AVERAGED = (
     "beta_mean", "clipped_beta_mean", "clip_level", "clipped_share", "effective_sample_size", "proximal_weight",

@@ -9,6 +9,8 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from outlap.envs.rewards import CURRICULA
+from outlap.envs.sb3_vec_env import SB3VecEnv
 from outlap.errors import OutlapError
 from outlap.mql.context_vec_env import ContextVecEnv
 from outlap.mql.policies import MQLPolicy
@@ -42,6 +44,9 @@ def add_step(
 ) -> None:
     """Add what a step of an environment returned; where an episode ended, begin the next.
 
+    Terms of outlap's rewards that have a curriculum are kept unscaled where nothing between the environment and the
+    buffer can have changed the reward; other rewards are kept as they are.
+
     Args:
         buffer: that the rows are added to.
         env: that was stepped.
@@ -56,7 +61,12 @@ def add_step(
         for name, value in infos[world]["terminal_observation"].items():
             arrived[name][world] = value
         terminated[world] = not infos[world].get("TimeLimit.truncated", False)
-    buffer.add(np.arange(len(dones)), arrived, action, reward, terminated)
+    terms: np.ndarray | float = 0.0
+    inner = env.venv if isinstance(env, ContextVecEnv) else env
+    if isinstance(inner, SB3VecEnv) and buffer.scales.shape == (len(CURRICULA),):
+        terms, buffer.scales = inner.env.curriculum_terms, inner.env.curriculum_scales
+        reward = reward - terms @ buffer.scales
+    buffer.add(np.arange(len(dones)), arrived, action, reward, terminated, terms)
     if len(over):
         first = {name: value[over] for name, value in observation.items()}
         buffer.begin(over, first, [task_of(env.reset_infos[world]) for world in over.tolist()])
@@ -80,7 +90,9 @@ class Collector:
         actions = self.env.action_space.shape
         assert actions is not None
         # An episode of n transitions has n + 1 rows: at most twice as many rows as steps.
-        self.buffer = ReplayBuffer(2 * self.env.num_envs * (steps + 2), space, actions[0], self.env.num_envs)
+        self.buffer = ReplayBuffer(
+            2 * self.env.num_envs * (steps + 2), space, actions[0], self.env.num_envs, curriculum_terms=len(CURRICULA)
+        )
         self.observation: Any = self.env.reset()
         begin_episodes(self.buffer, self.env, self.observation)
 

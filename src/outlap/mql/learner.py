@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from outlap.mql.batch import Batch
 from outlap.mql.config import TD3Config
 from outlap.mql.policies import MQLPolicy
-from outlap.mql.replay import Batch
 
 
 class Critique(NamedTuple):

@@ -18,13 +18,15 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
+from outlap.envs.rewards import CURRICULA
 from outlap.errors import OutlapError
+from outlap.mql.batch import Batch
 from outlap.mql.collector import add_step, begin_episodes
 from outlap.mql.config import TD3Config
 from outlap.mql.context_vec_env import ContextVecEnv
 from outlap.mql.learner import td3_update
 from outlap.mql.policies import MQLPolicy
-from outlap.mql.replay import Batch, ReplayBuffer
+from outlap.mql.replay import ReplayBuffer
 
 
 class MQL(OffPolicyAlgorithm):
@@ -96,7 +98,7 @@ class MQL(OffPolicyAlgorithm):
         self.set_random_seed(self.seed)
         self.replay_buffer = ReplayBuffer(
             self.buffer_size, self.observation_space, self.action_space.shape[0], self.n_envs,  # type: ignore[arg-type, index]
-            task_capacity=self.task_buffer_size,
+            task_capacity=self.task_buffer_size, curriculum_terms=len(CURRICULA),
         )  # fmt: skip
         self.policy = self.policy_class(
             self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs

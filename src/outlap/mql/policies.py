@@ -15,8 +15,9 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor
 
 from outlap.errors import OutlapError
+from outlap.mql.batch import Windows
 from outlap.mql.networks import PRESETS, PREVIOUS_REWARD, windows_from
-from outlap.mql.replay import ReplayBuffer, Windows
+from outlap.mql.replay import ReplayBuffer
 
 
 @dataclass

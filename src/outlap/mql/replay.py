@@ -4,6 +4,9 @@ A row is what a learner knows at one moment: the observation, and the action and
 have serial numbers in the order in which they were added; a ring of `capacity` rows keeps the newest. Each row
 names the row before it and the one after it in its episode, so that episodes of many worlds may lie mixed, and a
 window stops where its episode began or where older rows are gone.
+
+A reward may have terms whose scales change over a training. A row keeps them unscaled, beside the rest of its reward;
+what is read is scaled as the newest rows are, so that a crash costs what it costs at present, whenever it happened.
 """
 
 from __future__ import annotations
@@ -11,7 +14,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,67 +25,13 @@ from torch import Tensor
 
 from outlap.errors import OutlapError, brief
 from outlap.files import replacing
+from outlap.mql.batch import Batch, Windows
 from outlap.mql.recent import Recent, grown
 
 NONE = -1  # serial of no row
 
 
 TaskName = str | int | None  # None where an environment names no task
-
-
-@dataclass(frozen=True)
-class Windows:
-    """Sequences of rows, oldest first, as a network goes through them: step by step."""
-
-    steps: Tensor  # float32 (length, n, columns): the action that led to each row, then each term asked for
-    columns: dict[str, slice]  # of each term in `steps`
-    valid: Tensor  # bool (length, n): False before an episode's start, where all else is 0
-
-    @property
-    def action(self) -> Tensor:
-        """(length, n, actions) that led to each row; 0 at an episode's start."""
-        ends = min((columns.start for columns in self.columns.values()), default=None)
-        return self.steps[..., :ends]
-
-    @property
-    def observation(self) -> dict[str, Tensor]:
-        """(length, n, size) of each term."""
-        return {name: self.steps[..., columns] for name, columns in self.columns.items()}
-
-    def first(self, rows: int) -> Windows:
-        """Return the first `rows` rows of each window."""
-        return Windows(self.steps[:rows], self.columns, self.valid[:rows])
-
-    def to(self, device: torch.device) -> Windows:
-        """Return the windows on a device."""
-        return Windows(self.steps.to(device), self.columns, self.valid.to(device))
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Transitions of `steps` steps each, with the windows that belong to both of their ends."""
-
-    serial: np.ndarray  # int64 (n,) of the rows that they depart from
-    task: np.ndarray  # int64 (n,) positions in `ReplayBuffer.tasks`
-    windows: Windows  # of history + n_steps rows: up to the departure, then onwards; the last row repeated at the end
-    observation: dict[str, Tensor]  # float32 (n, size) of every term, at the departure
-    next_observation: dict[str, Tensor]  # (n, size) at the arrival
-    action: Tensor  # float32 (n, actions) taken at the departure
-    reward: Tensor  # float32 (n,) discounted sum over the steps
-    discount: Tensor  # float32 (n,) of the arrival's value: γ^steps, 0 where the episode terminated there
-    steps: Tensor  # int64 (n,) 1 … n_steps; fewer at the end of an episode
-
-    def to(self, device: torch.device) -> Batch:
-        """Return the batch on a device."""
-        if device.type == "cpu":
-            return self
-        return replace(
-            self,
-            windows=self.windows.to(device),
-            observation={name: term.to(device) for name, term in self.observation.items()},
-            next_observation={name: term.to(device) for name, term in self.next_observation.items()},
-            **{name: getattr(self, name).to(device) for name in ("action", "reward", "discount", "steps")},
-        )
 
 
 class ReplayBuffer:
@@ -98,6 +46,7 @@ class ReplayBuffer:
         *,
         half_precision: Sequence[str] = ("scan",),
         task_capacity: int | None = None,
+        curriculum_terms: int = 0,
     ) -> None:
         """Reserve the memory; it is taken as rows come in.
 
@@ -108,6 +57,7 @@ class ReplayBuffer:
             num_worlds: that add a row at each step.
             half_precision: terms stored as float16 (a range of 30 m to 8 mm).
             task_capacity: newest transitions of each task that `sample` may draw; None: all that are kept.
+            curriculum_terms: of the reward, whose scales change.
 
         Raises OutlapError for a capacity that cannot hold one transition of each world.
         """
@@ -122,7 +72,9 @@ class ReplayBuffer:
             for name, box in observation_space.spaces.items()
         }
         self.action = np.zeros((capacity, action_size), np.float32)
-        self.reward = np.zeros(capacity, np.float32)
+        self.reward = np.zeros(capacity, np.float32)  # without the terms of `curriculum`
+        self.curriculum = np.zeros((capacity, curriculum_terms), np.float32)  # terms of the reward, unscaled
+        self.scales = np.zeros(curriculum_terms)  # of these terms at present
         self.terminated = np.zeros(capacity, bool)
         self.before = np.full(capacity, NONE)  # serial of the row before in the episode
         self.after = np.full(capacity, NONE)
@@ -170,7 +122,8 @@ class ReplayBuffer:
         zero = np.zeros(len(worlds), np.float32)
         action = np.zeros((len(worlds), self.action.shape[1]), np.float32)
         self.task_now[worlds] = numbers
-        self._add(np.asarray(worlds), observation, action, zero, zero > 0, np.full(len(worlds), NONE), numbers)
+        none = np.full(len(worlds), NONE)
+        self._add(np.asarray(worlds), observation, action, zero, zero > 0, none, numbers, 0.0)
 
     def add(
         self,
@@ -179,6 +132,7 @@ class ReplayBuffer:
         action: np.ndarray,
         reward: np.ndarray,
         terminated: np.ndarray,
+        curriculum: np.ndarray | float = 0.0,
     ) -> None:
         """Add the next row of some worlds: one transition each.
 
@@ -186,15 +140,16 @@ class ReplayBuffer:
             worlds: (n,) their numbers; each has begun an episode.
             observation: (n, size) of each term, that the action led to; an episode's last one too.
             action: (n, actions).
-            reward: (n,).
+            reward: (n,), without the terms of `curriculum`.
             terminated: bool (n,): the episode is over, and not cut short.
+            curriculum: (n, terms) that `scales` multiplies when the reward is read.
         """
         worlds = np.asarray(worlds)
         before = self.latest[worlds]
         if (before == NONE).any():
             raise OutlapError("replay: a world has no episode; call begin first")
         tasks = self.task_now[worlds]
-        self._add(worlds, observation, action, reward, terminated, before, tasks)
+        self._add(worlds, observation, action, reward, terminated, before, tasks, curriculum)
         kept = before >= self.oldest
         self.after[before[kept] % self.capacity] = self.latest[worlds[kept]]
         for number in np.unique(tasks):
@@ -265,7 +220,7 @@ class ReplayBuffer:
         self, serial: np.ndarray, history: int, n_steps: int, gamma: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `_trace`."""
-        given = np.asarray(serial, np.int64), self.before, self.after, self.reward
+        given = np.asarray(serial, np.int64), self.before, self.after, self.reward, self.curriculum, self.scales
         return _trace(*given, self.oldest, history, n_steps, gamma)
 
     def _read(self, rows: np.ndarray, terms: Sequence[str]) -> Windows:
@@ -279,13 +234,14 @@ class ReplayBuffer:
         columns = {name: slice(*place) for name, place in zip(terms, pairwise(ends), strict=True)}
         return Windows(steps.view(*rows.shape, ends[-1]), columns, valid)
 
-    def _add(self, worlds, observation, action, reward, terminated, before, tasks) -> None:
+    def _add(self, worlds, observation, action, reward, terminated, before, tasks, curriculum) -> None:
         serial = self.added + np.arange(len(worlds))
         rows = serial % self.capacity
         for name, column in self.observation.items():
             column[rows] = observation[name]
         self.action[rows] = action
         self.reward[rows] = reward
+        self.curriculum[rows] = curriculum
         self.terminated[rows] = terminated
         self.before[rows] = before
         self.after[rows] = NONE
@@ -298,7 +254,7 @@ class ReplayBuffer:
         used = min(self.added, self.capacity)
         arrays = {name: getattr(self, name)[:used] for name in ROW_FIELDS}
         arrays |= {f"observation/{name}": column[:used] for name, column in self.observation.items()}
-        arrays |= {"latest": self.latest, "task_now": self.task_now}
+        arrays |= {"latest": self.latest, "task_now": self.task_now, "scales": self.scales}
         facts = {
             "capacity": self.capacity,
             "task_capacity": self.task_capacity,
@@ -319,6 +275,8 @@ class ReplayBuffer:
             column = getattr(self, name)
             if column.dtype != kind or column.ndim != axes:
                 raise ValueError(f"{name} is {column.dtype} with {column.ndim} axes")
+        if self.scales.dtype != np.float64 or self.scales.shape != self.curriculum.shape[1:]:
+            raise ValueError(f"scales are {self.scales.dtype} {self.scales.shape}")
         for name, column in self.observation.items():
             if column.dtype not in (np.float16, np.float32) or column.ndim != 2:
                 raise ValueError(f"observation/{name} is {column.dtype} with {column.ndim} axes")
@@ -333,7 +291,7 @@ class ReplayBuffer:
             buffer = cls.__new__(cls)
             buffer.capacity, buffer.task_capacity = int(facts["capacity"]), int(facts["task_capacity"])
             buffer.added = int(facts["added"])
-            buffer.latest, buffer.task_now = arrays["latest"], arrays["task_now"]
+            buffer.latest, buffer.task_now, buffer.scales = (arrays[name] for name in ("latest", "task_now", "scales"))
             buffer.tasks = facts["tasks"]
             buffer._numbers = {task: number for number, task in enumerate(buffer.tasks)}
             buffer.observation = {
@@ -356,7 +314,7 @@ class ReplayBuffer:
 
 
 ROW_FIELDS = {  # type of number and axes
-    "action": (np.float32, 2), "reward": (np.float32, 1), "terminated": (np.bool_, 1),
+    "action": (np.float32, 2), "reward": (np.float32, 1), "curriculum": (np.float32, 2), "terminated": (np.bool_, 1),
     "before": (np.int64, 1), "after": (np.int64, 1), "task": (np.int64, 1),
 }  # fmt: skip
 
@@ -367,7 +325,7 @@ def _select(column: np.ndarray, rows: Tensor) -> Tensor:
 
 
 @njit(cache=True)
-def _trace(serial, before, after, reward, oldest, history, n_steps, gamma):
+def _trace(serial, before, after, reward, curriculum, scales, oldest, history, n_steps, gamma):
     """Where the rows of transitions lie that depart from some rows.
 
     Returns:
@@ -393,6 +351,9 @@ def _trace(serial, before, after, reward, oldest, history, n_steps, gamma):
             if there != NONE:
                 here[i] = there
                 steps[i] += 1
-                returns[i] += gamma**t * reward[there % capacity]
+                gained = float(reward[there % capacity])
+                for k in range(len(scales)):
+                    gained += scales[k] * curriculum[there % capacity, k]
+                returns[i] += gamma**t * gained
             rows[history + t, i] = here[i] % capacity
     return rows, steps, returns.astype(np.float32)
