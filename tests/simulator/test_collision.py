@@ -21,7 +21,7 @@ CLEARANCE = 0.03  # [m] at which a car may pass a wall
 
 def in_contact(track: Track, x, y, yaw, length, width, atlas=None) -> bool:
     atlas = atlas or build_atlas([track])
-    return touches_wall(atlas, 0, float(x), float(y), yaw, 0.5 * length, 0.5 * width)
+    return touches_wall(atlas, np.int32(0), float(x), float(y), yaw, 0.5 * length, 0.5 * width)
 
 
 def overlap(first, second) -> bool:

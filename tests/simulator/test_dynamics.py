@@ -155,7 +155,7 @@ POWER_SLIDE: Manoeuvre = [
 def drive(model, integrator, state, manoeuvre: Manoeuvre, dt, row):
     for duration, rate, push in manoeuvre:
         for _ in range(round(duration / dt)):
-            state = integrate(model, integrator, state, rate, push, dt, row)
+            state = integrate(model, integrator, state, float(rate), float(push), dt, row)
     return np.array(state)
 
 

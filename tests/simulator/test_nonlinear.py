@@ -184,7 +184,7 @@ def test_a_mirrored_car_drives_the_mirrored_path(steer, speed, yaw_rate, slip, r
 
 
 @njit(error_model="numpy")
-def drive_at_random(integrator, commands, hold, dt, row):
+def drive_at_random(model, integrator, commands, hold, dt, row):
     """The largest magnitude of each state column over a drive; every command is held for `hold` steps."""
     state = (0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     largest = np.zeros(9)
@@ -192,7 +192,7 @@ def drive_at_random(integrator, commands, hold, dt, row):
         steer, speed = commands[k // hold]
         rate = min(max((steer - state[2]) / dt, -row["steer_rate_max"]), row["steer_rate_max"])
         push = motor_force(speed, state[3] * math.cos(state[6]), row) / row["m"]
-        state = integrate(NONLINEAR_SINGLE_TRACK, integrator, state, rate, push, dt, row)
+        state = integrate(model, integrator, state, rate, push, dt, row)
         for i, value in enumerate(state):
             if not abs(value) <= largest[i]:  # NaN gets in, too
                 largest[i] = abs(value)
@@ -210,7 +210,7 @@ def test_random_cars_driven_at_random_stay_finite_and_bounded(integrator, dt):
         row["brake_split"], row["engine_split"] = rng.uniform(0, 1, 2)
         derive(NONLINEAR_SINGLE_TRACK, integrator, dt, row)
         commands = rng.uniform([row["steer_min"], row["v_min"]], [row["steer_max"], row["v_max"]], (50, 2))
-        largest = drive_at_random(integrator, commands, round(0.2 / dt), dt, row)
+        largest = drive_at_random(NONLINEAR_SINGLE_TRACK, integrator, commands, round(0.2 / dt), dt, row)
         assert np.all(np.isfinite(largest)), (row, largest)
         assert largest[3] <= 1.05 * row["v_max"]
         assert largest[4] <= math.pi

@@ -94,11 +94,12 @@ def _drive(atlas, constants, worlds, w, c, steer_command, speed_command):
     worlds.before[w, c, 0] = state[column.X]
     worlds.before[w, c, 1] = state[column.Y]
     worlds.before[w, c, 2] = state[column.YAW]
+    # float() would leave these float32 until the loop widens them: Numba would compile the dynamics for both.
     now = (
-        float(state[column.X]), float(state[column.Y]), float(state[column.STEER]),
-        float(state[column.SPEED]), float(state[column.YAW]), float(state[column.YAW_RATE]),
-        float(state[column.SLIP]), float(state[column.WHEEL_SPEED_FRONT]),
-        float(state[column.WHEEL_SPEED_REAR]),
+        np.float64(state[column.X]), np.float64(state[column.Y]), np.float64(state[column.STEER]),
+        np.float64(state[column.SPEED]), np.float64(state[column.YAW]), np.float64(state[column.YAW_RATE]),
+        np.float64(state[column.SLIP]), np.float64(state[column.WHEEL_SPEED_FRONT]),
+        np.float64(state[column.WHEEL_SPEED_REAR]),
     )  # fmt: skip
     h = dt / constants.substeps
     for _ in range(constants.substeps):

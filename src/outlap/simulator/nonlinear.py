@@ -45,7 +45,7 @@ def axle_scale(stiffness, shape, curvature):
     return 1.0 / math.sin(min(angle, HALF_PI))
 
 
-@njit(cache=True, error_model="numpy", fastmath=CONTRACT, inline="always")
+@njit(cache=True, error_model="numpy", fastmath=CONTRACT, forceinline=True)
 def lateral_share(sideways, forward, slowest, stiffness, shape, curvature, scale):
     """The lateral force of an axle that rolls freely / its grip, positive to the left.
 
@@ -63,7 +63,7 @@ def lateral_share(sideways, forward, slowest, stiffness, shape, curvature, scale
     return math.copysign(scale * sine_wide(shape * arctangent(x)), -sideways)
 
 
-@njit(cache=True, error_model="numpy", fastmath=CONTRACT, inline="always")
+@njit(cache=True, error_model="numpy", fastmath=CONTRACT, forceinline=True)
 def axle_demands(u, acceleration, p):
     """What a step asks of the axles, constant over it.
 
@@ -88,7 +88,7 @@ def axle_demands(u, acceleration, p):
     return front_grip, rear_grip, front_demand, rear_demand
 
 
-@njit(cache=True, error_model="numpy", fastmath=CONTRACT, inline="always")
+@njit(cache=True, error_model="numpy", fastmath=CONTRACT, forceinline=True)
 def axle_shares(demand, sliding, rolling, most, slowest, stiffness, shape, curvature, scale):
     """The forces of an axle / its grip, within the friction ellipse: longitudinal, lateral.
 
@@ -108,7 +108,7 @@ def axle_shares(demand, sliding, rolling, most, slowest, stiffness, shape, curva
     return demand, lateral * math.sqrt(max(1.0 - demand * demand, 0.0))
 
 
-@njit(cache=True, error_model="numpy", fastmath=CONTRACT, inline="always")
+@njit(cache=True, error_model="numpy", fastmath=CONTRACT, forceinline=True)
 def nonlinear_rates(u, v, yaw_rate, cos_steer, sin_steer, demands, slowest, p):
     """The time derivatives of the motion in the car's frame, as for a car above `p.kinematic_speed`.
 
@@ -144,7 +144,7 @@ def nonlinear_rates(u, v, yaw_rate, cos_steer, sin_steer, demands, slowest, p):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=CONTRACT, inline="always")
+@njit(cache=True, error_model="numpy", fastmath=CONTRACT, forceinline=True)
 def _turned(cos, sin, angle):
     """(cos, sin) of an angle after a turn of less than 0.6 rad, to 1e-10."""
     y = angle * angle

@@ -127,18 +127,19 @@ class Simulator:
         _check(which.ndim == 1 and which.dtype != bool, "which", which, "it must be (n,) indices of worlds")
         which = which.astype(np.int64)
         n, cars = len(which), self.num_cars
-        keys = np.ascontiguousarray(keys, np.uint64)
-        tracks = np.ascontiguousarray(tracks, np.int32)
+        # Writeable, or copied: Numba would compile the kernel again for each argument that is read-only.
+        keys = np.require(keys, np.uint64, "CW")
+        tracks = np.require(tracks, np.int32, "CW")
         if params.dtype != PARAMETERS:  # a record's dtype takes longer to print than to compare
             _check(False, "params", f"of type {params.dtype}", "it must be vehicle.PARAMETERS")
-        params = np.ascontiguousarray(params)
-        starts = np.ascontiguousarray(starts, np.float64)
+        params = np.require(params, None, "CW")
+        starts = np.require(starts, np.float64, "CW")
         _check_shape("keys", keys, (n,))
         _check_shape("tracks", tracks, (n,))
         _check_shape("params", params, (n, cars))
         _check_shape("starts", starts, (n, cars, 4))
         road_bins = self.worlds.road.shape[1]
-        road = np.ones((n, road_bins), np.float32) if road is None else np.ascontiguousarray(road, np.float32)
+        road = np.ones((n, road_bins), np.float32) if road is None else np.require(road, np.float32, "CW")
         _check_shape("road", road, (n, road_bins))
         if n == 0:
             return
