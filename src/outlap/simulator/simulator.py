@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import DTypeLike
 from pydantic import Field
 
 from outlap.config import Config
@@ -127,19 +128,18 @@ class Simulator:
         _check(which.ndim == 1 and which.dtype != bool, "which", which, "it must be (n,) indices of worlds")
         which = which.astype(np.int64)
         n, cars = len(which), self.num_cars
-        # Writeable, or copied: Numba would compile the kernel again for each argument that is read-only.
-        keys = np.require(keys, np.uint64, "CW")
-        tracks = np.require(tracks, np.int32, "CW")
+        keys = _writeable(keys, np.uint64)
+        tracks = _writeable(tracks, np.int32)
         if params.dtype != PARAMETERS:  # a record's dtype takes longer to print than to compare
             _check(False, "params", f"of type {params.dtype}", "it must be vehicle.PARAMETERS")
-        params = np.require(params, None, "CW")
-        starts = np.require(starts, np.float64, "CW")
+        params = _writeable(params, PARAMETERS)
+        starts = _writeable(starts, np.float64)
         _check_shape("keys", keys, (n,))
         _check_shape("tracks", tracks, (n,))
         _check_shape("params", params, (n, cars))
         _check_shape("starts", starts, (n, cars, 4))
         road_bins = self.worlds.road.shape[1]
-        road = np.ones((n, road_bins), np.float32) if road is None else np.require(road, np.float32, "CW")
+        road = np.ones((n, road_bins), np.float32) if road is None else _writeable(road, np.float32)
         _check_shape("road", road, (n, road_bins))
         if n == 0:
             return
@@ -213,6 +213,12 @@ class Simulator:
         kernel(*arguments)
         self.compile_seconds = (self.compile_seconds or 0.0) + time.perf_counter() - begin
         self._called.add(kernel)
+
+
+def _writeable(values: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+    """Return an array for a kernel, which Numba would compile once more for one that is read-only."""
+    array = np.ascontiguousarray(values, dtype)
+    return array if array.flags.writeable else array.copy()
 
 
 def _check(holds: bool, name: str, value: object, remedy: str) -> None:
