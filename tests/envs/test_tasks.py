@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from any_worlds import FIELDS, PARTS
 from outlap.config import bounds
 from outlap.envs.keywords import make_race_vector
 from outlap.envs.tasks import TaskSet, TaskSplit
@@ -17,11 +18,9 @@ from outlap.simulator.vehicle import (
     DERIVED,
     N_PARAMS,
     NAMES,
-    ActuatorParams,
     AxleTyres,
     LidarParams,
     PacejkaTyre,
-    SensorParams,
     VehicleParams,
     to_records,
     to_values,
@@ -31,16 +30,6 @@ from outlap.track.catalog import load_tracks
 from outlap.track.generate import BUILTIN_HELD_OUT, BUILTIN_TRAIN
 from outlap.track.map_io import write_track
 from outlap.track.track import Track
-
-PARTS = {
-    "vehicle": VehicleParams,
-    "axles": AxleTyres,
-    "tyre": PacejkaTyre,
-    "actuators": ActuatorParams,
-    "sensors": SensorParams,
-    "lidar": LidarParams,
-}
-FIELDS = [(part, name) for part, cls in PARTS.items() for name in cls.model_fields if name not in ("axles", "tyre")]
 
 
 def test_there_is_a_field_for_every_column():

@@ -15,7 +15,16 @@ from typing import NamedTuple
 import numpy as np
 
 from outlap.errors import OutlapError
-from outlap.simulator.vehicle import DERIVED, NAMES, accepted_bounds
+from outlap.simulator.vehicle import (
+    DERIVED,
+    NAMES,
+    ActuatorParams,
+    LidarParams,
+    SensorParams,
+    VehicleParams,
+    accepted_bounds,
+    parameter_bounds,
+)
 
 
 class TrainingRange(NamedTuple):
@@ -24,14 +33,6 @@ class TrainingRange(NamedTuple):
     low: float
     high: float
     difficult: int  # -1: small values are harder to drive, 1: large ones
-
-    @property
-    def middle(self) -> float:
-        return 0.5 * (self.low + self.high)
-
-    @property
-    def half(self) -> float:
-        return 0.5 * (self.high - self.low)
 
 
 TRAINING_RANGES = {
@@ -50,6 +51,10 @@ TRAINING_RANGES = {
 }
 """What differs between cars: the parameters of `training` and of the test cars, scaled by which they are in -1 … 1."""
 
+MIDDLES = np.array([0.5 * (each.low + each.high) for each in TRAINING_RANGES.values()])  # of the training ranges
+HALVES = np.array([0.5 * (each.high - each.low) for each in TRAINING_RANGES.values()])  # half their widths
+
+NO_CAR = -1  # the number of a car that is drawn from ranges
 TEST_SPLITS = ("inside", "edge", "outside", "hard")
 TRAINING = "training"
 
@@ -79,11 +84,24 @@ class CarSet:
         return [NAMES.index(name) for name in self.parameters]
 
 
-def scaled(values: np.ndarray, parameters: tuple[str, ...] = tuple(TRAINING_RANGES)) -> np.ndarray:
-    """Return parameters (..., parameters) as multiples of half their training range from its middle."""
-    middle = np.array([TRAINING_RANGES[name].middle for name in parameters])
-    half = np.array([TRAINING_RANGES[name].half for name in parameters])
-    return (values - middle) / half
+def scaled(values: np.ndarray) -> np.ndarray:
+    """Return the parameters of TRAINING_RANGES, (..., parameters), as multiples of half their range from its middle."""
+    return (values - MIDDLES) / HALVES
+
+
+def parameter_ends(
+    vehicle: VehicleParams, actuators: ActuatorParams, lidar: LidarParams, sensors: SensorParams, cars: CarSet | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest value of each parameter of a car: float32 (N_PARAMS,) each.
+
+    Args:
+        vehicle, actuators, lidar, sensors: the ranges.
+        cars: in place of the values above; None: these.
+    """
+    low, high = parameter_bounds(vehicle, actuators, lidar, sensors)
+    if cars is not None:
+        low[cars.columns], high[cars.columns] = cars.bounds
+    return low, high
 
 
 def find_cars(name: str) -> CarSet:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from outlap.envs.car_sets import NO_CAR
 from outlap.envs.racing_line import ReferenceSpeeds
 from outlap.simulator import state as column
 from outlap.simulator.atlas import FIRST_ROW, ROWS, SPACING
@@ -63,7 +64,7 @@ class Race:
         self.racing = np.ones(everyone, bool)
         self.places_gained = np.zeros(everyone, np.int64)
         self.places_lost = np.zeros(everyone, np.int64)
-        self.cars = np.full(everyone, -1, np.int64)
+        self.cars = np.full(everyone, NO_CAR, np.int64)
         self.rewards = np.zeros(everyone)
         self.final_rewards = np.zeros(everyone)
 

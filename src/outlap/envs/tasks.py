@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from outlap.envs.car_sets import CarSet
+from outlap.envs.car_sets import NO_CAR, CarSet, parameter_ends
 from outlap.errors import OutlapError
 from outlap.simulator.seeding import CAR_STREAM, PARAMETER_STREAM, TRACK_STREAM, uniform
 from outlap.simulator.vehicle import (
@@ -17,12 +17,9 @@ from outlap.simulator.vehicle import (
     LidarParams,
     SensorParams,
     VehicleParams,
-    parameter_bounds,
     to_records,
 )
 from outlap.track.track import Track
-
-NO_CAR = -1  # the number of a car that is drawn from ranges
 
 
 class Tasks(NamedTuple):
@@ -62,10 +59,7 @@ class TaskSet:
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The smallest and the largest value of each parameter of a car: float32 (N_PARAMS,) each."""
-        low, high = parameter_bounds(self.vehicle, self.actuators, self.lidar, self.sensors)
-        if self.cars is not None:
-            low[self.cars.columns], high[self.cars.columns] = self.cars.bounds
-        return low, high
+        return parameter_ends(self.vehicle, self.actuators, self.lidar, self.sensors, self.cars)
 
     def draw(self, keys: np.ndarray, episodes: np.ndarray, num_cars: int, egos: np.ndarray | None = None) -> Tasks:
         """Return the tasks of some worlds' next episodes; every car is drawn on its own.

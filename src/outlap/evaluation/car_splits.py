@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from outlap.drivers.classical import PurePursuit
-from outlap.envs.car_sets import TRAINING_RANGES, CarSet
+from outlap.envs.car_sets import HALVES, MIDDLES, TRAINING_RANGES, CarSet
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.terminations import FINISHED, TerminationConfig
@@ -64,18 +64,15 @@ def draw_split(split: str, count: int, seed: int, tracks: list[Track]) -> DrawnS
 
 
 def _draw(split: str, count: int, rng: np.random.Generator) -> CarSet:
-    ranges = TRAINING_RANGES.values()
-    u = rng.uniform(-1.0, 1.0, (count, len(ranges)))
+    u = rng.uniform(-1.0, 1.0, (count, len(MIDDLES)))
     low, high = SHELLS[split]
     # 1 - share is in (0, 1]: the lower end of a shell belongs to the one inside.
     u *= (high - (high - low) * rng.random((count, 1))) / np.abs(u).max(axis=1, keepdims=True)
     if split == "hard":
-        u = np.abs(u) * np.array([each.difficult for each in ranges])
-    middle = np.array([each.middle for each in ranges])
-    half = np.array([each.half for each in ranges])
+        u = np.abs(u) * np.array([each.difficult for each in TRAINING_RANGES.values()])
     never_negative = np.array([name.endswith("_delay") for name in TRAINING_RANGES])
-    values = middle + u * half
-    values = np.where(never_negative & (values < 0.0), middle - u * half, values)
+    values = MIDDLES + u * HALVES
+    values = np.where(never_negative & (values < 0.0), MIDDLES - u * HALVES, values)
     return CarSet(split, tuple(TRAINING_RANGES), values.astype(np.float32), listed=True)
 
 

@@ -22,7 +22,7 @@ from outlap.envs.race import EGO
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.terminations import TerminationConfig
-from outlap.evaluation.protocol import episode_seeds, episode_task, parameter_ends
+from outlap.evaluation.protocol import car_ends, episode_seeds, episode_task
 from outlap.planning.limits import CarLimits
 from outlap.planning.min_laps import MinLaps, min_laps
 from outlap.simulator import state as column
@@ -51,9 +51,7 @@ class Yardstick:
 
         The table spans the set. Raises OutlapError where no line can be planned.
         """
-        low, high = parameter_ends(task.model_copy(update={"cars": ""}))
-        low[cars.columns], high[cars.columns] = cars.bounds
-        table = min_laps(track, (low, high), task.model)
+        table = min_laps(track, car_ends(task, cars), task.model)
         limits = [CarLimits.of_record(record, task.model) for record in car_records(task, cars)]
         return cls(table.of(limits), table)
 

@@ -11,14 +11,14 @@ from gymnasium.vector import AutoresetMode
 
 from outlap.drivers.driver import Driver
 from outlap.drivers.find import find_drivers
-from outlap.envs.car_sets import find_cars
+from outlap.envs.car_sets import CarSet, find_cars, parameter_ends
 from outlap.envs.observations import check_terms
 from outlap.envs.race_config import RaceConfig, StartConfig
 from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import RewardConfig
 from outlap.envs.terminations import TerminationConfig
 from outlap.errors import OutlapError
-from outlap.simulator.vehicle import parameter_bounds, parameter_names
+from outlap.simulator.vehicle import parameter_names
 from outlap.track.track import Track
 
 CRAWL = 1.0  # [m/s] mean speed at which the default time limit still allows all laps and the way to the line
@@ -112,16 +112,19 @@ def single_race(driver: Driver, config: RaceConfig, track: Track) -> RaceVectorE
     return env
 
 
-def parameter_ends(config: RaceConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest and the largest value of each parameter of a task's cars: (N_PARAMS,) each."""
-    low, high = parameter_bounds(config.vehicle, config.actuators, config.lidar, config.sensors)
-    if config.cars:
+def car_ends(config: RaceConfig, cars: CarSet | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest value of each parameter of a task's cars: float32 (N_PARAMS,) each.
+
+    Args:
+        config: the task.
+        cars: a set in place of the one that `config.cars` names.
+    """
+    if cars is None and config.cars:
         cars = find_cars(config.cars)
-        low[cars.columns], high[cars.columns] = cars.bounds
-    return low, high
+    return parameter_ends(config.vehicle, config.actuators, config.lidar, config.sensors, cars)
 
 
 def drawn_parameters(config: RaceConfig) -> dict[str, int]:
     """Return those of a car's parameters that differ between cars: the name of each in a row, its `vehicle` column."""
-    low, high = parameter_ends(config)
+    low, high = car_ends(config)
     return {name: column for column, name in enumerate(parameter_names()) if low[column] < high[column]}

@@ -24,7 +24,7 @@ from outlap.envs.race_vector_env import RaceVectorEnv
 from outlap.envs.rewards import CURRICULUM_END, RewardConfig, scaled_terms, weighted_terms
 from outlap.envs.terminations import CRASH
 from outlap.errors import OutlapError
-from outlap.evaluation.protocol import drawn_parameters, episode_seeds, episode_task, parameter_ends
+from outlap.evaluation.protocol import car_ends, drawn_parameters, episode_seeds, episode_task
 from outlap.planning.limits import CarLimits
 from outlap.planning.min_laps import min_laps
 from outlap.simulator.vehicle import to_records
@@ -220,7 +220,7 @@ def _with_lap_time_ratios(
     lapped = np.array([row["completed_laps"] > 0 for row in rows])
     if wanted and lapped.any():
         try:
-            table = min_laps(track, parameter_ends(config), config.model)
+            table = min_laps(track, car_ends(config), config.model)
         except OutlapError as problem:  # of the yardstick alone: what was raced is worth no less
             log.warning("no lap_time_ratio: %s", problem)
         else:

@@ -72,11 +72,12 @@ def derive(model, integrator, dt, p):
     p.road_friction = 1.0
     p.front_scale = axle_scale(p.front_B, p.front_C, p.front_E)
     p.rear_scale = axle_scale(p.rear_B, p.rear_C, p.rear_E)
-    front_slope, rear_slope = p.mu * p.C_Sf, p.mu * p.C_Sr
     if model == NONLINEAR_SINGLE_TRACK:
         front_slope = p.mu * p.front_peak * p.front_scale * p.front_C * p.front_B
         rear_slope = p.mu * p.rear_peak * p.rear_scale * p.rear_C * p.rear_B
-    p.kinematic_speed = slowest_stable_speed(front_slope, rear_slope, p, dt, integrator)
+        p.kinematic_speed = slowest_stable_speed(front_slope, rear_slope, p, dt, integrator)
+    else:
+        p.kinematic_speed = kinematic_speed(p, dt, integrator)
 
 
 @njit(cache=True, error_model="numpy")
